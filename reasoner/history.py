@@ -81,11 +81,9 @@ class Past:
 
 
 def spread[T](items: Sequence[T], most: int) -> list[T]:
-    """Return at most `most` items, evenly; the first and the last stay (of one: the last)."""
+    """Return at most `most` items, two at least, evenly; the first and the last stay."""
     if len(items) <= most:
         return list(items)
-    if most == 1:
-        return [items[-1]]
     return [items[round(index * (len(items) - 1) / (most - 1))] for index in range(most)]
 
 

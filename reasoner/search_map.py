@@ -30,13 +30,8 @@ type Pose = tuple[float, float, float]
 """x, y in meters and yaw in radians, in the odometry's frame."""
 
 
-@dataclass(frozen=True, slots=True)
-class Point:
-    """A place in the frame of the mobile base, meters."""
-
-    x: float
-    y: float
-    z: float
+type Point = tuple[float, float, float]
+"""x, y, z in the frame of the mobile base, meters."""
 
 
 @dataclass(slots=True)
@@ -81,7 +76,7 @@ class Places:
         self.base_pose = UNMOVED if pose is None else (pose[0], pose[1], pose[2])
         point = [{"point_base_m": data["point_base_m"], "score": 1.0}] if _POINT in data else []
         things = data.get("seen") or point
-        seen = [self._place(Point(*thing["point_base_m"]), thing["score"]) for thing in things]
+        seen = [self._place(thing["point_base_m"], thing["score"]) for thing in things]
         if self.joined:
             others = list(others)
             seen = [place for place in seen if not _is_other(place, others)]
@@ -92,8 +87,8 @@ class Places:
         return bool(seen)
 
     def _place(self, point: Point, score: float) -> Place:
-        x, y = _from(self.base_pose, point.x, point.y)
-        return Place(x, y, point.z, score, math.hypot(point.x, point.y))
+        ahead, left, z = point
+        return Place(*_from(self.base_pose, ahead, left), z, score, math.hypot(ahead, left))
 
     def _see(self, seen: Place, before: list[Place]) -> None:
         """Add one place of a look. `before`: places that are not matched in this look yet."""
@@ -117,7 +112,7 @@ class Places:
     def from_base(self, place: Place) -> Point:
         """Return its position relative to the base at the newest look."""
         x0, y0, yaw = self.base_pose
-        return Point(*_from((0.0, 0.0, -yaw), place.x - x0, place.y - y0), place.z)
+        return (*_from((0.0, 0.0, -yaw), place.x - x0, place.y - y0), place.z)
 
 
 @dataclass(slots=True)

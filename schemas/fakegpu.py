@@ -199,12 +199,7 @@ def is_process_file(name: str) -> bool:
 # -- texts
 def parse_config(text: str | bytes) -> FakeGpuConfig:
     """Read `gpu.json`. Raises ConfigError."""
-    try:
-        return FakeGpuConfig.model_validate_json(text)
-    except ValidationError as error:
-        raise ConfigError(
-            f"{GPU_FILE} of a simulated GPU is wrong: {_first(error)}", hint="correct it"
-        ) from None
+    return _parsed(FakeGpuConfig, GPU_FILE, text, "correct it")
 
 
 def dump_config(config: FakeGpuConfig) -> str:
@@ -223,16 +218,10 @@ def read_gpu(texts: Mapping[str, str], log_tail: str) -> Change:
             f"the folder of a simulated GPU has no {GPU_FILE}",
             hint="start the arbiter with --gpu fake:8GiB",
         )
-    processes = {}
-    for name in sorted(texts):
-        if is_process_file(name):
-            try:
-                processes[name] = ProcessFile.model_validate_json(texts[name])
-            except ValidationError as error:
-                hint = "remove it if no process owns it"
-                raise ConfigError(
-                    f"{name} of a simulated GPU is wrong: {_first(error)}", hint=hint
-                ) from None
+    processes = {
+        name: _parsed(ProcessFile, name, texts[name], "remove it if no process owns it")
+        for name in sorted(filter(is_process_file, texts))
+    }
     newest = _last_line(log_tail)
     logged = int(newest.get("seq", 0))
     lasts = [process.last for process in processes.values()]
@@ -268,9 +257,16 @@ def _dump(line: JsonMap) -> str:
     return json.dumps(line, separators=(",", ":")) + "\n"
 
 
-def _first(error: ValidationError) -> str:
-    problem = error.errors()[0]
-    return f"{'.'.join(str(part) for part in problem['loc']) or 'the text'}: {problem['msg']}"
+def _parsed[M: BaseModel](model: type[M], name: str, text: str | bytes, hint: str) -> M:
+    """Return the text of a file as its model. Raises ConfigError."""
+    try:
+        return model.model_validate_json(text)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        place = ".".join(str(part) for part in problem["loc"]) or "the text"
+        raise ConfigError(
+            f"{name} of a simulated GPU is wrong: {place}: {problem['msg']}", hint=hint
+        ) from None
 
 
 # -- transitions

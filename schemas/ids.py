@@ -4,7 +4,7 @@ Standard library only: this is the one schema module that the sans-IO core may i
 `schemas.defaults`.
 """
 
-from typing import NamedTuple, NewType, Self
+from typing import NamedTuple, NewType
 
 LeaseId = NewType("LeaseId", str)
 """Names one lease for ever, e.g. `L3-17` (epoch 3, serial 17)."""
@@ -34,14 +34,6 @@ class Token(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.epoch}.{self.serial}"
-
-    @classmethod
-    def parse(cls, text: str) -> Self:
-        """Read `epoch.serial`. Raises ValueError on anything else."""
-        epoch, dot, serial = text.partition(".")
-        if not dot or not epoch.isdecimal() or not serial.isdecimal():
-            raise ValueError(f"a token is written EPOCH.SERIAL, not {text!r}")
-        return cls(int(epoch), int(serial))
 
 
 class ProcessKey(NamedTuple):

@@ -14,6 +14,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from typing import Annotated, Literal, TypedDict, get_args
 
 from pydantic import (
@@ -313,7 +314,13 @@ def parse_skill_call(rskill_id: str, arguments: str | JsonMap) -> ExecuteRskill:
 
 
 def function_schema(tool: type[ToolCall]) -> FunctionTool:
-    """The function description of a tool."""
+    """The function description of a tool, the caller's own."""
+    return copy.deepcopy(_function_schema(tool))
+
+
+@cache
+def _function_schema(tool: type[ToolCall]) -> FunctionTool:
+    """Pydantic takes a millisecond for it, and each question to a planner offers all of them."""
     parameters = tool.model_json_schema(by_alias=False)
     name = parameters["properties"].pop("tool")["const"]
     description = " ".join(parameters.pop("description").split())

@@ -5,32 +5,39 @@ from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 
-def collector_url(text: str) -> str:
-    """Return `text`. Raises ValueError unless it is http://HOST... or https://HOST...."""
+def http_url(text: str, expected: str) -> str:
+    """Return `text`. Raises ValueError, which says what was `expected`, unless it is http://HOST...
+    or https://HOST...."""
     try:
         parts = urlsplit(text)
         good = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
     except ValueError:
         good = False
     if not good:
-        shown = text.rpartition("@")[2].partition("?")[0]  # without password and token
-        raise ValueError(
-            f"expected the URL of a collector, got {shown!r}; write http://localhost:4318"
-        )
+        raise ValueError(f"expected {expected}, got {_shown(text)!r}")
     return text
+
+
+def collector_url(text: str) -> str:
+    """Return `text`. Raises ValueError unless it is the URL of a collector."""
+    return http_url(text, "the URL of a collector such as http://localhost:4318")
 
 
 def webhook_url(text: str) -> str:
     """Return `text`. Raises ValueError unless it is the URL of a webhook."""
-    parts = urlsplit(text)  # raises ValueError too
-    shown = text.rpartition("@")[2].partition("?")[0]
-    if parts.scheme not in ("http", "https") or not parts.hostname or parts.port == 0:
-        raise ValueError(f"expected the URL of a webhook such as https://HOST/PATH, got {shown!r}")
+    parts = urlsplit(http_url(text, "the URL of a webhook such as https://HOST/PATH"))
     if parts.username is not None or parts.fragment:
-        raise ValueError(f"a webhook has neither user nor fragment, got {shown!r}")
+        raise ValueError(f"a webhook has neither user nor fragment, got {_shown(text)!r}")
     if not text.isascii() or not text.isprintable() or " " in text:
-        raise ValueError(f"expected a URL without spaces and special characters, got {shown!r}")
+        raise ValueError(
+            f"expected a URL without spaces and special characters, got {_shown(text)!r}"
+        )
     return text
+
+
+def _shown(url: str) -> str:
+    """Return a URL without password and token."""
+    return url.rpartition("@")[2].partition("?")[0]
 
 
 @dataclass(frozen=True, slots=True)

@@ -170,29 +170,7 @@ class CameraModel(_Frozen):
         )
 
 
-# -- detections
-class Detection(_Frozen):
-    """One box that a detector found in one picture."""
-
-    label: Annotated[str, Field(min_length=1)]
-    confidence: UnitInterval
-    box: Box2d
-
-    @field_validator("box")
-    @classmethod
-    def _ordered(cls, box: Box2d) -> Box2d:
-        if box[2] <= box[0] or box[3] <= box[1]:
-            raise ValueError(
-                "a box is x_min, y_min, x_max, y_max with x_max > x_min and y_max > y_min"
-            )
-        return box
-
-    @property
-    def center(self) -> tuple[float, float]:
-        """Middle of the box, in pixels."""
-        return ((self.box[0] + self.box[2]) / 2, (self.box[1] + self.box[3]) / 2)
-
-
+# -- objects
 class Pose(_Frozen):
     """Position in metres and unit quaternion x, y, z, w, expressed in `frame_id`."""
 

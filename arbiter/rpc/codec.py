@@ -10,7 +10,7 @@ Pure: no sockets, no sessions.
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any, get_args
+from typing import Any
 
 import msgpack
 from pydantic import TypeAdapter, ValidationError
@@ -42,7 +42,7 @@ UNKNOWN_KEY = "Extra inputs are not permitted"
 _VALIDATE = {op: TypeAdapter(cls).validator.validate_python for op, cls in REQUESTS.items()}
 _pack: Callable[[object], bytes] = msgpack.Packer(use_bin_type=True).pack
 
-_PLAIN = encoders(*get_args(AnyReply.__value__), *get_args(AnyPush.__value__), ErrorView)
+_PLAIN = encoders(*AnyReply.__subclasses__(), *AnyPush.__subclasses__(), ErrorView)
 _WORDED = (RenewReply, ReattachReply, StatusReply, WhyReply, DeniedPush, LostPush, RevokePush)
 """Replies and pushes that may hold codes of the engine; `words` says them."""
 

@@ -137,26 +137,26 @@ class LlmPlanner(ABC):
 
     def _rejected(self, problem: str) -> None:
         self.tally.rejected += 1
-        self._transcript.rejected(problem)
+        self._transcript.tell("rejected", problem=problem)
         tracing.event(telemetry.EVENT_ANSWER_REJECTED, **{telemetry.ATTR_REASON: problem})
 
     async def _ask(self, turns: Sequence[Turn], functions: Sequence[FunctionTool]) -> Answer:
         url, body = self._request(turns, functions)
-        with measured(self.provider, self.config, self.tally) as chat:
+        with measured(self.provider, self.config, self.tally) as answered:
             try:
                 reply = await self._http.post(url, body)
                 answer = self._read(reply)
             except LlmError as error:
-                self._transcript.failed(body, str(error))
+                self._transcript.tell("failed", request=body, problem=str(error))
                 raise
             except (ValueError, LookupError, TypeError, AttributeError) as error:
-                self._transcript.failed(body, repr(error))
+                self._transcript.tell("failed", request=body, problem=repr(error))
                 raise LlmError(
                     f"{without_credentials(url)} did not answer as this API does: {error!r}",
                     hint="is it the right backend?",
                 ) from error
-            self._transcript.answered(body, reply)
-            chat.answered(answer)
+            self._transcript.tell("answered", request=body, answer=reply)
+            answered(answer)
         return answer
 
 

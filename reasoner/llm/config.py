@@ -4,9 +4,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
-from urllib.parse import urlsplit
 
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.urls import http_url
 
 TIMEOUT_S = 60.0
 BUSY_S = 240.0  # for a busy server to find time, all pauses and refusals together
@@ -45,9 +45,10 @@ class LlmConfig:
             raise ConfigError(
                 f"{' and '.join(missing)} not set", hint="export them, or use the scripted planner"
             )
-        if not _is_address(url):
-            shown = url.rpartition("@")[2].partition("?")[0]  # no password, no token
-            raise ConfigError(f"{PREFIX}BASE_URL: expected an http(s) address, got {shown!r}")
+        try:
+            http_url(url, "an http(s) address")
+        except ValueError as error:
+            raise ConfigError(f"{PREFIX}BASE_URL: {error}") from None
         return cls(
             url.rstrip("/"),
             environ[PREFIX + "MODEL"],
@@ -56,14 +57,6 @@ class LlmConfig:
             int(_number(environ, "MAX_TOKENS", MAX_TOKENS, "tokens", least=1.0)),
             _number(environ, "BUSY_S", BUSY_S, "seconds"),
         )
-
-
-def _is_address(url: str) -> bool:
-    try:
-        parts = urlsplit(url)
-        return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
-    except ValueError:
-        return False
 
 
 def _key(environ: Mapping[str, str]) -> str:

@@ -3,7 +3,7 @@
 One span `chat MODEL` a request, below `reasoner.plan`, with every try of the request in it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from time import monotonic
@@ -40,33 +40,9 @@ class Tally:
         return cast(LlmUsage, {"model": model, **asdict(self)})
 
 
-@dataclass(frozen=True, slots=True)
-class Chat:
-    """One request while it is measured."""
-
-    tally: Tally
-    labels: dict[str, str]
-
-    def answered(self, answer: Answer) -> None:
-        self.tally.input_tokens += answer.input_tokens
-        self.tally.output_tokens += answer.output_tokens
-        noted: dict[str, str | int] = {
-            names.ATTR_INPUT_TOKENS: answer.input_tokens,
-            names.ATTR_OUTPUT_TOKENS: answer.output_tokens,
-        }
-        if answer.model:
-            noted[names.ATTR_RESPONSE_MODEL] = answer.model
-        tracing.note(noted)
-        if answer.finish_reason:
-            tracing.note({names.ATTR_FINISH_REASONS: [answer.finish_reason]})
-        for kind, tokens in (("input", answer.input_tokens), ("output", answer.output_tokens)):
-            labels = self.labels | {names.ATTR_TOKEN_TYPE: kind}
-            meters.measure(names.GEN_AI_TOKENS, tokens, labels)
-
-
 @contextmanager
-def measured(provider: str, config: LlmConfig, tally: Tally) -> Iterator[Chat]:
-    """Measure one request, whatever becomes of it."""
+def measured(provider: str, config: LlmConfig, tally: Tally) -> Iterator[Callable[[Answer], None]]:
+    """Measure one request, whatever becomes of it. Yields what its answer is told to."""
     labels = {
         names.ATTR_CHAT_OPERATION: "chat",
         names.ATTR_PROVIDER: provider,
@@ -83,10 +59,27 @@ def measured(provider: str, config: LlmConfig, tally: Tally) -> Iterator[Chat]:
     began_s = monotonic()
     with tracing.span(f"chat {config.model}", attributes=attributes, client=True):
         try:
-            yield Chat(tally, labels)
+            yield lambda answer: _note(answer, tally, labels)
         except VramError as error:
             tally.failed += 1
             labels = labels | {telemetry.ATTR_ERROR_TYPE: error.code}
             raise
         finally:
             meters.measure(names.GEN_AI_DURATION, monotonic() - began_s, labels)
+
+
+def _note(answer: Answer, tally: Tally, labels: Mapping[str, str]) -> None:
+    """Note an answer's tokens and words about itself in tally, span and metrics."""
+    tally.input_tokens += answer.input_tokens
+    tally.output_tokens += answer.output_tokens
+    noted: dict[str, str | int] = {
+        names.ATTR_INPUT_TOKENS: answer.input_tokens,
+        names.ATTR_OUTPUT_TOKENS: answer.output_tokens,
+    }
+    if answer.model:
+        noted[names.ATTR_RESPONSE_MODEL] = answer.model
+    tracing.note(noted)
+    if answer.finish_reason:
+        tracing.note({names.ATTR_FINISH_REASONS: [answer.finish_reason]})
+    for kind, tokens in (("input", answer.input_tokens), ("output", answer.output_tokens)):
+        meters.measure(names.GEN_AI_TOKENS, tokens, {**labels, names.ATTR_TOKEN_TYPE: kind})

@@ -329,8 +329,8 @@ class _Script:
         return self._go(json.dumps({"turn_rad": angle_rad}), why)
 
     def _drive(self, point: Point, why: str) -> ExecuteRskill:
-        target = {"target_point": {"x": point.x, "y": point.y, "z": point.z}}
-        return self._go(json.dumps(target), why)
+        target = dict(zip("xyz", point, strict=True))
+        return self._go(json.dumps({"target_point": target}), why)
 
     def _stand(self, pose: Pose, why: str) -> ExecuteRskill:
         x, y, yaw = pose

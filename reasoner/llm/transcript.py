@@ -7,9 +7,9 @@ pictures are left out.
 import base64
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any, Literal
 
 from vram_arbiter.reasoner.json_lines import JsonLines
-from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.reasoner import TranscriptLine
 
 PICTURE_MIN_CHARS = 1024  # a shorter text does not hold a picture
@@ -24,18 +24,11 @@ class Transcript(JsonLines):
     def __init__(self, path: Path | None) -> None:
         super().__init__(path, "--transcript")
 
-    def answered(self, request: JsonObject, answer: JsonObject) -> None:
-        self._tell(TranscriptLine(kind="answered", request=request, answer=answer, at=_now()))
-
-    def failed(self, request: JsonObject, problem: str) -> None:
-        """The server gave no answer of its API."""
-        self._tell(TranscriptLine(kind="failed", request=request, problem=problem, at=_now()))
-
-    def rejected(self, problem: str) -> None:
-        """The answer before was not taken: the model is told why and asked again."""
-        self._tell(TranscriptLine(kind="rejected", problem=problem, at=_now()))
-
-    def _tell(self, line: TranscriptLine) -> None:
+    def tell(self, kind: Literal["answered", "failed", "rejected"], **fields: Any) -> None:
+        """Write a line: `request` with the API's `answer`, or with the `problem` where it gave
+        none; of an answer that was not taken, the `problem` alone."""
+        at = datetime.now(UTC).isoformat(timespec="milliseconds")
+        line = TranscriptLine(at=at, kind=kind, **fields)
         shown = line.model_copy(update={"request": without_pictures(line.request)})
         self.add(shown, without_none=True)
 
@@ -59,7 +52,3 @@ def _is_picture(text: str) -> bool:
         return bool(base64.b64decode(encoded, validate=True))
     except ValueError:
         return False
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="milliseconds")

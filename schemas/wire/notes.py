@@ -1,18 +1,19 @@
 """Notes: what happened, as history, subscribers, telemetry, the log and replays learn it.
 
-One class for each kind, with typed fields and no words; `AnyNote` lists them all. A note about a
-lease goes with `About`. `arbiter.rpc.words` makes the event of both: `{"kind", "lease_id"?,
-"consumer"?, "gpu"?, "traceparent"?, …, "reason"?}`. A field that has its default is left out.
+One class for each kind, with typed fields and no words. A note about a lease goes with `About`.
+`arbiter.rpc.words` makes the event of both: `{"kind", "lease_id"?, "consumer"?, "gpu"?,
+"traceparent"?, …, "reason"?}`. A field that has its default is left out.
 Standard library only.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Final, Literal, get_args
+from typing import Final, Literal
 
 from vram_arbiter.schemas.ids import GpuId, LeaseId, UseId
 from vram_arbiter.schemas.wire.codes import Cause, Order, Wait, Why
 from vram_arbiter.schemas.wire.errors import Refusal
+from vram_arbiter.schemas.wire.tagged import Tagged
 from vram_arbiter.schemas.wire.views import BlockView
 
 _CODE: Final = {"part": "code"}
@@ -29,12 +30,13 @@ class About:
     traceparent: str | None = None
 
 
-# -- waiting and granting
-@dataclass(frozen=True, slots=True)
-class QueuedNote:
-    """A request waits."""
+class AnyNote(Tagged):
+    """Base of all notes."""
 
-    TAG: ClassVar = ("kind", "queued")
+
+# -- waiting and granting
+class QueuedNote(AnyNote, kind="queued"):
+    """A request waits."""
 
     position: int | None
     wait: Wait | None
@@ -42,21 +44,15 @@ class QueuedNote:
     block: BlockView | None = None  # why nothing is granted on its GPU
 
 
-@dataclass(frozen=True, slots=True)
-class GrantedNote:
-    TAG: ClassVar = ("kind", "granted")
-
+class GrantedNote(AnyNote, kind="granted"):
     charge_bytes: int
     waited_ms: float
     evicted: tuple[str, ...]  # consumers
     by_itself: bool = False  # back from standby, without an acquire
 
 
-@dataclass(frozen=True, slots=True)
-class ReadyNote:
+class ReadyNote(AnyNote, kind="ready"):
     """The holder has loaded."""
-
-    TAG: ClassVar = ("kind", "ready")
 
     charge_bytes: int
     declared_bytes: int
@@ -74,12 +70,9 @@ class EvictedLease:
     charge_bytes: int
 
 
-@dataclass(frozen=True, slots=True)
-class SwitchNote:
+class SwitchNote(AnyNote, kind="switch"):
     """Time of a grant from the acquire to `ready`, by phase; it comes with each `ready`. Of several
     victims the slowest counts. `switched`: a lease was evicted for it."""
-
-    TAG: ClassVar = ("kind", "switch")
 
     switched: bool
     evicted: tuple[EvictedLease, ...]
@@ -92,21 +85,15 @@ class SwitchNote:
     total_ms: float
 
 
-@dataclass(frozen=True, slots=True)
-class DeniedNote:
+class DeniedNote(AnyNote, kind="denied"):
     """A request that waited, or a grant that could not be recorded, is over."""
-
-    TAG: ClassVar = ("kind", "denied")
 
     refusal: Refusal = field(metadata=_CODE)
 
 
-@dataclass(frozen=True, slots=True)
-class RefusedNote:
+class RefusedNote(AnyNote, kind="refused"):
     """A request for bytes was refused at once. `left_out`: refusals of the same process that were
     not noted."""
-
-    TAG: ClassVar = ("kind", "refused")
 
     pid: int
     refusal: Refusal = field(metadata=_CODE)
@@ -114,29 +101,20 @@ class RefusedNote:
     left_out: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class CancelledNote:
-    TAG: ClassVar = ("kind", "cancelled")
-
+class CancelledNote(AnyNote, kind="cancelled"):
     why: Why
     by: str = ""
 
 
 # -- uses
-@dataclass(frozen=True, slots=True)
-class UseBeganNote:
-    TAG: ClassVar = ("kind", "use_began")
-
+class UseBeganNote(AnyNote, kind="use_began"):
     use_id: UseId
     label: str
     uses: int
     resumed: bool
 
 
-@dataclass(frozen=True, slots=True)
-class UseEndedNote:
-    TAG: ClassVar = ("kind", "use_ended")
-
+class UseEndedNote(AnyNote, kind="use_ended"):
     use_id: UseId
     label: str
     ms: float
@@ -145,11 +123,8 @@ class UseEndedNote:
 
 
 # -- leaving
-@dataclass(frozen=True, slots=True)
-class RevokeAskedNote:
+class RevokeAskedNote(AnyNote, kind="revoke_asked"):
     """A holder is revoked for the first time."""
-
-    TAG: ClassVar = ("kind", "revoke_asked")
 
     wanted_by: str  # consumer of the waiter
     wanted_by_lease: LeaseId | None
@@ -158,11 +133,8 @@ class RevokeAskedNote:
     order: Order | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class RevokeWithdrawnNote:
+class RevokeWithdrawnNote(AnyNote, kind="revoke_withdrawn"):
     """A revoke ends without an eviction: nothing wants the bytes any more."""
-
-    TAG: ClassVar = ("kind", "revoke_withdrawn")
 
     wanted_by: str  # consumer of the waiter that is gone
     cause: Cause
@@ -170,35 +142,23 @@ class RevokeWithdrawnNote:
     ms: float  # since the revoke
 
 
-@dataclass(frozen=True, slots=True)
-class RevokeAckedNote:
-    TAG: ClassVar = ("kind", "revoke_acked")
-
+class RevokeAckedNote(AnyNote, kind="revoke_acked"):
     safe_point_eta_s: float | None
     uses: int
 
 
-@dataclass(frozen=True, slots=True)
-class RemindedNote:
-    TAG: ClassVar = ("kind", "reminded")
-
+class RemindedNote(AnyNote, kind="reminded"):
     uses: int
     acked: bool
 
 
-@dataclass(frozen=True, slots=True)
-class DeadlinePassedNote:
-    TAG: ClassVar = ("kind", "deadline_passed")
-
+class DeadlinePassedNote(AnyNote, kind="deadline_passed"):
     uses: int
     wanted_by: str
 
 
-@dataclass(frozen=True, slots=True)
-class SignalledNote:
+class SignalledNote(AnyNote, kind="signalled"):
     """An operator ended the process of a holder."""
-
-    TAG: ClassVar = ("kind", "signalled")
 
     signal: Literal["term", "kill"]
     pid: int
@@ -206,34 +166,22 @@ class SignalledNote:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class UnloadingNote:
-    TAG: ClassVar = ("kind", "unloading")
-
+class UnloadingNote(AnyNote, kind="unloading"):
     asked: bool
 
 
-@dataclass(frozen=True, slots=True)
-class ReleasedNote:
-    TAG: ClassVar = ("kind", "released")
-
+class ReleasedNote(AnyNote, kind="released"):
     exiting: bool
     was: str  # its state before
     why: Why
 
 
-@dataclass(frozen=True, slots=True)
-class ExpiredNote:
-    TAG: ClassVar = ("kind", "expired")
-
+class ExpiredNote(AnyNote, kind="expired"):
     why: Why
     ttl_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class LostNote:
-    TAG: ClassVar = ("kind", "lost")
-
+class LostNote(AnyNote, kind="lost"):
     why: Why
     pid: int | None = None
 
@@ -247,11 +195,8 @@ class Culprit:
     bytes: int
 
 
-@dataclass(frozen=True, slots=True)
-class VerifiedNote:
+class VerifiedNote(AnyNote, kind="verified"):
     """A verdict. `resolved` False: the verification goes on."""
-
-    TAG: ClassVar = ("kind", "verified")
 
     verdict: str
     resolved: bool
@@ -263,22 +208,16 @@ class VerifiedNote:
 
 
 # -- standby
-@dataclass(frozen=True, slots=True)
-class StandbyNote:
+class StandbyNote(AnyNote, kind="standby"):
     """A lease is away. `comes_back`: by itself."""
-
-    TAG: ClassVar = ("kind", "standby")
 
     left_for: str
     parked_bytes: int
     comes_back: bool
 
 
-@dataclass(frozen=True, slots=True)
-class ParkedNote:
+class ParkedNote(AnyNote, kind="parked"):
     """A lease is away, its weights are in host RAM. `comes_back`: by itself."""
-
-    TAG: ClassVar = ("kind", "parked")
 
     left_for: str
     parked_bytes: int
@@ -286,21 +225,15 @@ class ParkedNote:
 
 
 # -- measurements
-@dataclass(frozen=True, slots=True)
-class OomNote:
-    TAG: ClassVar = ("kind", "oom")
-
+class OomNote(AnyNote, kind="oom"):
     requested_bytes: int
     allocated_bytes: int | None
     charge_bytes: int
     learnt_load_peak_bytes: int | None
 
 
-@dataclass(frozen=True, slots=True)
-class DriftNote:
+class DriftNote(AnyNote, kind="drift"):
     """A footprint is not what was declared. Said once for a lease and part."""
-
-    TAG: ClassVar = ("kind", "drift")
 
     part: str
     declared_bytes: int
@@ -316,11 +249,8 @@ class OverHolder:
     over_bytes: int
 
 
-@dataclass(frozen=True, slots=True)
-class PressureNote:
+class PressureNote(AnyNote, kind="pressure"):
     """A GPU holds more than its budget, or (0 bytes) no longer does."""
-
-    TAG: ClassVar = ("kind", "pressure")
 
     gpu: GpuId
     pressure_bytes: int
@@ -328,82 +258,55 @@ class PressureNote:
     holders: tuple[OverHolder, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class StowawayNote:
-    TAG: ClassVar = ("kind", "stowaway")
-
+class StowawayNote(AnyNote, kind="stowaway"):
     gpu: GpuId
     pid: int
     name: str
     used_bytes: int
 
 
-@dataclass(frozen=True, slots=True)
-class ProbeFailedNote:
-    TAG: ClassVar = ("kind", "probe_failed")
-
+class ProbeFailedNote(AnyNote, kind="probe_failed"):
     gpu: GpuId
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class ProbeOkNote:
-    TAG: ClassVar = ("kind", "probe_ok")
-
+class ProbeOkNote(AnyNote, kind="probe_ok"):
     gpu: GpuId
 
 
 # -- the daemon
-@dataclass(frozen=True, slots=True)
-class JournalFailedNote:
-    TAG: ClassVar = ("kind", "journal_failed")
-
+class JournalFailedNote(AnyNote, kind="journal_failed"):
     key: str
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class RecoveredNote:
+class RecoveredNote(AnyNote, kind="recovered"):
     """What the journal told at the start. `leases`: what must be accounted for."""
-
-    TAG: ClassVar = ("kind", "recovered")
 
     leases: tuple[str, ...]
     records: int
     doubt: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class ReattachedNote:
-    TAG: ClassVar = ("kind", "reattached")
-
+class ReattachedNote(AnyNote, kind="reattached"):
     uses: int
     state: str
 
 
-@dataclass(frozen=True, slots=True)
-class ServingNote:
+class ServingNote(AnyNote, kind="serving"):
     """Grants begin, so long after the start."""
-
-    TAG: ClassVar = ("kind", "serving")
 
     seconds: float
 
 
-@dataclass(frozen=True, slots=True)
-class ResumedNote:
+class ResumedNote(AnyNote, kind="resumed"):
     """The machine was suspended, or the daemon stopped."""
-
-    TAG: ClassVar = ("kind", "resumed")
 
     slept_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class OperatorNote:
+class OperatorNote(AnyNote, kind="operator"):
     """An operator's order was followed."""
-
-    TAG: ClassVar = ("kind", "operator")
 
     action: str
     by: str
@@ -413,44 +316,7 @@ class OperatorNote:
     silent_s: float | None = None
 
 
-type AnyNote = (
-    QueuedNote
-    | GrantedNote
-    | ReadyNote
-    | SwitchNote
-    | DeniedNote
-    | RefusedNote
-    | CancelledNote
-    | UseBeganNote
-    | UseEndedNote
-    | RevokeAskedNote
-    | RevokeWithdrawnNote
-    | RevokeAckedNote
-    | RemindedNote
-    | DeadlinePassedNote
-    | SignalledNote
-    | UnloadingNote
-    | ReleasedNote
-    | ExpiredNote
-    | LostNote
-    | VerifiedNote
-    | StandbyNote
-    | ParkedNote
-    | OomNote
-    | DriftNote
-    | PressureNote
-    | StowawayNote
-    | ProbeFailedNote
-    | ProbeOkNote
-    | JournalFailedNote
-    | RecoveredNote
-    | ReattachedNote
-    | ServingNote
-    | ResumedNote
-    | OperatorNote
-)
-
-NOTES: Final[Mapping[str, type]] = {cls.TAG[1]: cls for cls in get_args(AnyNote.__value__)}
+NOTES: Final[Mapping[str, type]] = {cls.TAG[1]: cls for cls in AnyNote.__subclasses__()}
 """Every note of the engine by its kind."""
 
 WARNING_KINDS: Final = frozenset(

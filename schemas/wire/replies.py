@@ -6,17 +6,16 @@ from typing import Literal
 
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.errors import ErrorView
-from vram_arbiter.schemas.wire.explained import LeaseDetail, WhyReply
+from vram_arbiter.schemas.wire.explained import LeaseDetail
+from vram_arbiter.schemas.wire.tagged import AnyReply as AnyReply
 from vram_arbiter.schemas.wire.views import DaemonView, GpuView, HostRamView, LeaseView, Totals
 
 
-@dataclass(frozen=True, slots=True)
-class DoneReply:
+class DoneReply(AnyReply):
     """Done, with nothing to say: `subscribe`, `bye`."""
 
 
-@dataclass(frozen=True, slots=True)
-class WelcomeReply:
+class WelcomeReply(AnyReply):
     """Answer to `hello`."""
 
     version: int
@@ -27,41 +26,35 @@ class WelcomeReply:
     grace_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class PingReply:
+class PingReply(AnyReply):
     server: str
 
 
-@dataclass(frozen=True, slots=True)
-class AcquireReply:
+class AcquireReply(AnyReply):
     """Answer to `acquire` and `reacquire`: `loading` or `queued`."""
 
     state: str
     lease: LeaseView
 
 
-@dataclass(frozen=True, slots=True)
-class ReadyReply:
+class ReadyReply(AnyReply):
     lease: LeaseView
 
 
-@dataclass(frozen=True, slots=True)
-class UsesReply:
+class UsesReply(AnyReply):
     """Answer to `use_begin` and `use_end`: busy uses of the lease."""
 
     uses: int
 
 
-@dataclass(frozen=True, slots=True)
-class StateReply:
+class StateReply(AnyReply):
     """Answer to `revoke_ack`, `unloading` and `cancel`."""
 
     state: str
     uses: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ReleaseReply:
+class ReleaseReply(AnyReply):
     """`next`: what the lease becomes once its bytes are measured gone: `released`, `standby` or
     `parked`."""
 
@@ -75,8 +68,7 @@ class GoneLease:
     error: ErrorView
 
 
-@dataclass(frozen=True, slots=True)
-class RenewReply:
+class RenewReply(AnyReply):
     alive: tuple[str, ...]
     gone: tuple[GoneLease, ...]
 
@@ -91,20 +83,17 @@ class ReattachedView:
     error: ErrorView | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ReattachReply:
+class ReattachReply(AnyReply):
     leases: tuple[ReattachedView, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class OomReply:
+class OomReply(AnyReply):
     """`learnt_load_peak_bytes`: the footprint from now on; None: it was not the footprint."""
 
     learnt_load_peak_bytes: int | None
 
 
-@dataclass(frozen=True, slots=True)
-class StatusReply:
+class StatusReply(AnyReply):
     """The state of everything. `leases` is a page of the live ones: held, loading, …, then the
     queue in order."""
 
@@ -123,8 +112,7 @@ class StatusReply:
     daemon: DaemonView | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class HistoryReply:
+class HistoryReply(AnyReply):
     """Events after a number, oldest first. `problem`: why older ones cannot be read, in words.
 
     `numbering` names the history that the numbers belong to. Another name: the numbers began again.
@@ -136,8 +124,7 @@ class HistoryReply:
     numbering: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class OperatorReply:
+class OperatorReply(AnyReply):
     """Answer to `evict`, `kill`, `pin`, `unpin` and `release_dead`; `lease` is None when it is
     over."""
 
@@ -145,37 +132,14 @@ class OperatorReply:
     lease: LeaseView | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class DrainReply:
+class DrainReply(AnyReply):
     """Answer to `drain` and `resume`: the operator that drained the arbiter, and why; "" while it
     grants."""
 
     drained: str
 
 
-@dataclass(frozen=True, slots=True)
-class PrepareReply:
+class PrepareReply(AnyReply):
     """`told`: sessions of the consumer that the hint went to."""
 
     told: int
-
-
-type AnyReply = (
-    DoneReply
-    | WelcomeReply
-    | PingReply
-    | AcquireReply
-    | ReadyReply
-    | UsesReply
-    | StateReply
-    | ReleaseReply
-    | RenewReply
-    | ReattachReply
-    | OomReply
-    | StatusReply
-    | HistoryReply
-    | OperatorReply
-    | DrainReply
-    | PrepareReply
-    | WhyReply
-)

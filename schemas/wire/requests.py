@@ -21,6 +21,7 @@ from vram_arbiter.schemas.limits import NAME, STRICT, AsPair, Bytes, Limits, Nam
 from vram_arbiter.schemas.wire import replies as r
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.spec import LeaseSpec
+from vram_arbiter.schemas.wire.tagged import Tagged
 
 LeaseIdText = Annotated[LeaseId, Limits(min_length=1, max_length=64)]
 UseName = Annotated[UseId, NAME]
@@ -43,39 +44,31 @@ class Envelope:
     traceparent: str | None = None
 
 
-class Request[R]:
+class Request[R](Tagged):
     """Base of all requests; `R` is the type of the reply."""
 
-    __slots__ = ()
     __pydantic_config__: ClassVar = STRICT
-    TAG: ClassVar[tuple[str, str]]
     WHOLE: ClassVar = True
 
 
 class Question[R](Request[R]):
     """A request that the session answers by itself: all that an observer may send."""
 
-    __slots__ = ()
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Hello(Question[r.WelcomeReply]):
+class Hello(Question[r.WelcomeReply], op="hello", kw_only=True):
     """First message of a connection. `instance` names the client object, to find its leases again
     after a reconnect."""
 
-    TAG: ClassVar = ("op", "hello")
     version: int = d.WIRE_VERSION
     name: Name
     instance: Name
     role: Role = "client"
 
 
-@dataclass(frozen=True, slots=True)
-class Acquire(Request[r.AcquireReply]):
+class Acquire(Request[r.AcquireReply], op="acquire"):
     """Ask for a lease. The same `nonce` from the same process is the same request: a repeat never
     makes a second lease."""
 
-    TAG: ClassVar = ("op", "acquire")
     nonce: Name
     spec: LeaseSpec
     wait_timeout_s: Seconds | None = None  # None waits for ever
@@ -92,7 +85,6 @@ class LeaseRef:
     token: TokenPair
 
 
-@dataclass(frozen=True, slots=True)
 class OnLease[R](Request[R]):
     """What a client says about a lease whose token it knows."""
 
@@ -100,61 +92,47 @@ class OnLease[R](Request[R]):
     token: TokenPair
 
 
-@dataclass(frozen=True, slots=True)
-class Ready(OnLease[r.ReadyReply]):
+class Ready(OnLease[r.ReadyReply], op="ready"):
     """The model is loaded; `measured_bytes` is what the holder sees of its own allocation (None: it
     cannot tell)."""
 
-    TAG: ClassVar = ("op", "ready")
     measured_bytes: Bytes | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class UseBegin(OnLease[r.UsesReply]):
+class UseBegin(OnLease[r.UsesReply], op="use_begin"):
     """Begin a use. Any client that knows the token may; the use ends with that client's process at
     the latest."""
 
-    TAG: ClassVar = ("op", "use_begin")
     use_id: UseName
     label: Annotated[str, Limits(max_length=d.NAME_MAX_CHARS)] = ""
 
 
-@dataclass(frozen=True, slots=True)
-class UseEnd(OnLease[r.UsesReply]):
+class UseEnd(OnLease[r.UsesReply], op="use_end"):
     """End a use; one that is over is fine."""
 
-    TAG: ClassVar = ("op", "use_end")
     use_id: UseName
 
 
-@dataclass(frozen=True, slots=True)
-class Renew(Request[r.RenewReply]):
+class Renew(Request[r.RenewReply], op="renew"):
     """Keep leases alive."""
 
-    TAG: ClassVar = ("op", "renew")
     leases: Annotated[
         tuple[LeaseRef, ...], Limits(max_length=d.LEASES_PER_CLIENT_MAX, fail_fast=True)
     ]
 
 
-@dataclass(frozen=True, slots=True)
-class RevokeAck(OnLease[r.StateReply]):
+class RevokeAck(OnLease[r.StateReply], op="revoke_ack"):
     """The holder heard `revoke`; `safe_point_eta_s` is its guess of when it will be
     between uses."""
 
-    TAG: ClassVar = ("op", "revoke_ack")
     safe_point_eta_s: Seconds | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Unloading(OnLease[r.StateReply]):
+class Unloading(OnLease[r.StateReply], op="unloading"):
     """The holder is at its safe point and unloads."""
 
-    TAG: ClassVar = ("op", "unloading")
 
-
-@dataclass(frozen=True, slots=True)
-class Release(OnLease[r.ReleaseReply]):
+class Release(OnLease[r.ReleaseReply], op="release"):
     """The holder has let go of the bytes (its process lives on: residue) or is about to exit
     (`exiting`).
 
@@ -162,25 +140,20 @@ class Release(OnLease[r.ReleaseReply]):
     `standby` or `parked`.
     """
 
-    TAG: ClassVar = ("op", "release")
     exiting: bool = False
     parked: bool = False  # the weights are in host RAM: the lease lives on as `parked`
 
 
-@dataclass(frozen=True, slots=True)
-class Cancel(Request[r.StateReply]):
+class Cancel(Request[r.StateReply], op="cancel"):
     """Give up a queued acquire."""
 
-    TAG: ClassVar = ("op", "cancel")
     lease_id: LeaseIdText
 
 
-@dataclass(frozen=True, slots=True)
-class Reacquire(OnLease[r.AcquireReply]):
+class Reacquire(OnLease[r.AcquireReply], op="reacquire"):
     """A lease that is away is wanted now: it waits like any other. `token` is the last one, so a
     late repeat asks for nothing."""
 
-    TAG: ClassVar = ("op", "reacquire")
     wait_timeout_s: Seconds | None = None
 
 
@@ -199,33 +172,27 @@ class ReattachLease:
     use_ids: UseNames = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Reattach(Request[r.ReattachReply]):
+class Reattach(Request[r.ReattachReply], op="reattach"):
     """After a reconnect: what this client still holds. The reply says per lease `kept` or
     why not."""
 
-    TAG: ClassVar = ("op", "reattach")
     leases: Annotated[
         tuple[ReattachLease, ...], Limits(max_length=d.LEASES_PER_CLIENT_MAX, fail_fast=True)
     ]
 
 
-@dataclass(frozen=True, slots=True)
-class Oom(OnLease[r.OomReply]):
+class Oom(OnLease[r.OomReply], op="oom"):
     """The consumer's allocation failed. Raises the learnt footprint of its model."""
 
-    TAG: ClassVar = ("op", "oom")
     requested_bytes: Bytes
     allocated_bytes: Bytes | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Status(Question[r.StatusReply]):
+class Status(Question[r.StatusReply], op="status"):
     """The state of everything. Leases come in pages: `after` is the `next` of the page before.
     `details`: with declared and measured bytes, and why each waiter waits; its pages are
     shorter. `leases`: with these alone, as far as they are not over, and without tokens."""
 
-    TAG: ClassVar = ("op", "status")
     WHOLE: ClassVar = False  # a question for everything says nothing of its pages
     details: bool = False
     leases: Annotated[
@@ -241,32 +208,24 @@ class Status(Question[r.StatusReply]):
     ) = None
 
 
-@dataclass(frozen=True, slots=True)
-class AskWhy(Question[WhyReply]):
+class AskWhy(Question[WhyReply], op="why"):
     """What blocks a consumer."""
 
-    TAG: ClassVar = ("op", "why")
     consumer: Name
 
 
-@dataclass(frozen=True, slots=True)
-class History(Question[r.HistoryReply]):
+class History(Question[r.HistoryReply], op="history"):
     """Events after a number, oldest first; a reply has at most 2000."""
 
-    TAG: ClassVar = ("op", "history")
     after: int = 0  # sequence number of the last event already seen
     limit: Annotated[int, Limits(ge=1, le=5000)] = 500
     kinds: Annotated[tuple[str, ...], Limits(max_length=d.LISTED_MAX, fail_fast=True)] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Subscribe(Question[r.DoneReply]):
+class Subscribe(Question[r.DoneReply], op="subscribe"):
     """Receive every history event as a push `event` from now on."""
 
-    TAG: ClassVar = ("op", "subscribe")
 
-
-@dataclass(frozen=True, slots=True)
 class ByHand[R](Request[R]):
     """An operator's action. `reason` is kept with the operator's name in history and, for pins and
     drains, in the journal."""
@@ -274,86 +233,56 @@ class ByHand[R](Request[R]):
     reason: Reason
 
 
-@dataclass(frozen=True, slots=True)
 class ByHandOn(ByHand[r.OperatorReply]):
     """One on a lease, by its id or by the name of a consumer that has exactly one."""
 
     target: Name
 
 
-@dataclass(frozen=True, slots=True)
-class Evict(ByHandOn):
+class Evict(ByHandOn, op="evict"):
     """Ask a holder to leave. In use it finishes first; a pinned one is refused."""
 
-    TAG: ClassVar = ("op", "evict")
 
-
-@dataclass(frozen=True, slots=True)
-class Kill(ByHandOn):
+class Kill(ByHandOn, op="kill"):
     """End the process of a stuck holder: SIGTERM, and SIGKILL when it is asked for again. Refused
     while another process uses one of its leases, or it uses one of another process."""
 
-    TAG: ClassVar = ("op", "kill")
 
-
-@dataclass(frozen=True, slots=True)
-class Pin(ByHandOn):
+class Pin(ByHandOn, op="pin"):
     """Protect the lease from eviction until it is unpinned."""
 
-    TAG: ClassVar = ("op", "pin")
 
-
-@dataclass(frozen=True, slots=True)
-class Unpin(ByHandOn):
+class Unpin(ByHandOn, op="unpin"):
     """Undo a pin."""
 
-    TAG: ClassVar = ("op", "unpin")
 
-
-@dataclass(frozen=True, slots=True)
-class ReleaseDead(ByHandOn):
+class ReleaseDead(ByHandOn, op="release_dead"):
     """Give up the lease of a holder that is not heard of, before its ttl is over. Refused in use,
     and for a holder that lives."""
 
-    TAG: ClassVar = ("op", "release_dead")
 
-
-@dataclass(frozen=True, slots=True)
-class Drain(ByHand[r.DrainReply]):
+class Drain(ByHand[r.DrainReply], op="drain"):
     """No new grants until `resume`; what is held is kept. Outlives the daemon, not the machine."""
 
-    TAG: ClassVar = ("op", "drain")
 
-
-@dataclass(frozen=True, slots=True)
-class Resume(ByHand[r.DrainReply]):
+class Resume(ByHand[r.DrainReply], op="resume"):
     """Grant again."""
 
-    TAG: ClassVar = ("op", "resume")
 
-
-@dataclass(frozen=True, slots=True)
-class Prepare(Request[r.PrepareReply]):
+class Prepare(Request[r.PrepareReply], op="prepare"):
     """A hint: the consumer's model is wanted soon. It is passed on to the consumer, which may read
     its weights into host RAM; it grants nothing and evicts nothing."""
 
-    TAG: ClassVar = ("op", "prepare")
     consumer: Name
 
 
-@dataclass(frozen=True, slots=True)
-class Ping(Question[r.PingReply]):
+class Ping(Question[r.PingReply], op="ping"):
     """A sign of life."""
 
-    TAG: ClassVar = ("op", "ping")
 
-
-@dataclass(frozen=True, slots=True)
-class Bye(Question[r.DoneReply]):
+class Bye(Question[r.DoneReply], op="bye"):
     """The client closes its socket. Its leases are released; a process that lives on keeps its
     residue."""
-
-    TAG: ClassVar = ("op", "bye")
 
 
 type AnyRequest = (

@@ -29,8 +29,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.support.attacks import ATTACKS
+from tests.support.children import Child, spawn
 from tests.support.fakegpu_check import check_log
-from tests.support.forkserver import Child, ForkServer
 from tests.support.lease_check import Finding, Hindrance, Story, check_leases, read_lines
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
@@ -94,11 +94,6 @@ class Storm:
         self._traces = self._arbiter.runtime / "traces"
         self._traces.mkdir()
         self._mounted = self._mount_state()
-        self._forks = ForkServer(
-            Path(__file__).with_name("worker.py"),
-            self._arbiter.environ,
-            self._arbiter.runtime / "errors.log",
-        )
         self._slots: dict[int, Child] = {}
         self._born = 0
         self._user: Child | None = None
@@ -148,7 +143,6 @@ class Storm:
     def _close(self) -> None:
         for child in self._children:
             child.close()
-        self._forks.close()
         self._keep_evidence()
         if self._arbiter.process is not None and self._arbiter.process.poll() is None:
             self._arbiter.kill()
@@ -181,9 +175,11 @@ class Storm:
 
     # -- processes
     def _spawn(self, kind: str, name: str, what: str) -> Child:
-        child = self._forks.spawn(
-            kind, name, what, str(self._arbiter.gpu_folder), str(self._traces), name=name
-        )
+        child = spawn(
+            "storm-worker", kind, name, what, str(self._arbiter.gpu_folder), str(self._traces),
+            name=name, environ=self._arbiter.environ,
+            errors=self._arbiter.runtime / "errors.log",
+        )  # fmt: skip
         self._children.append(child)
         return child
 

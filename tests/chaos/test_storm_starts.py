@@ -48,7 +48,6 @@ def storm(
     """`.run`: a storm that has started nothing; `.arbiter`: what it believes to be the daemon."""
     arbiter = Arbiter(tmp_path)
     monkeypatch.setattr(storm_module, "ArbiterProcess", lambda **_: arbiter)
-    monkeypatch.setattr(storm_module, "ForkServer", lambda *_: None)
     monkeypatch.setattr(storm_module.Storm, "_mount_state", lambda _: False)
     return SimpleNamespace(run=storm_module.Storm(1.0, 1, tmp_path), arbiter=arbiter)
 

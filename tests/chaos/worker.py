@@ -1,6 +1,6 @@
 """What a process of the storm does: a consumer that leases and loads for ever, a stranger that
 takes bytes without asking, or a user that marks uses on other people's leases. Not a test module;
-run by `tests.support.forkserver`.
+run by `tests.support.children`.
 
 A consumer writes down what it does, and when, in a trace of JSON lines: the checker's second
 witness beside the arbiter's history. It is honest but not careful: it loads after its grant without
@@ -15,7 +15,7 @@ import random
 import signal
 import sys
 import time
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -242,10 +242,10 @@ async def lines() -> asyncio.StreamReader:
     return reader
 
 
-def main(arguments: Sequence[str]) -> None:
+def main() -> None:
     """`consumer NAME SEED GPU_FOLDER TRACES`, `stowaway NAME BYTES GPU_FOLDER TRACES`,
     `user NAME - GPU_FOLDER TRACES` or `attacker NAME ATTACK:SECONDS GPU_FOLDER TRACES`."""
-    kind, name, what, gpu_folder, traces = arguments
+    kind, name, what, gpu_folder, traces = sys.argv[1:]
     trace = Trace(Path(traces) / f"{name}.jsonl", name)
     trace.say("born", kind=kind)
     try:

@@ -1,5 +1,5 @@
 """A consumer with the habits that users of the neighbours complain about. Not a test module; run by
-`tests.support.forkserver`.
+`tests.support.children`.
 
 Arguments: NAME BYTES GPU_FOLDER HABITS (JSON). It says `waiting`, `loading`, `ready`, `unloading`,
 `gone`. Habits: `slow` loads when it is told `go`, `stuck` never ends its unloading, `deaf` ignores
@@ -11,7 +11,6 @@ import asyncio
 import json
 import signal
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +64,8 @@ async def live(name: str, size: int, gpu_folder: Path, habits: dict[str, Any]) -
             pass
 
 
-def main(arguments: Sequence[str]) -> None:
-    name, size, gpu_folder, habits = arguments
+def main() -> None:
+    name, size, gpu_folder, habits = sys.argv[1:]
     wanted = json.loads(habits)
     if wanted.get("deaf"):
         signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -1,5 +1,5 @@
 """A consumer that stops at every step of its life and goes on when it is told `go`. Not a test
-module; run by `tests.support.forkserver`.
+module; run by `tests.support.children`.
 
 Arguments: NAME BYTES GPU_FOLDER RESIDUE_BYTES. It says `waiting`, `loading`, `ready`, `in_use`,
 `unloading`, `released`; it waits for `go` after `loading`, `in_use` and `unloading`. `use` begins a
@@ -8,7 +8,6 @@ use, which the next `go` ends.
 
 import asyncio
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 from tests.support.saying import say
@@ -76,6 +75,6 @@ async def live(name: str, size: int, gpu_folder: Path, residue: int) -> None:
         await listening
 
 
-def main(arguments: Sequence[str]) -> None:
-    name, size, gpu_folder, residue = arguments
+def main() -> None:
+    name, size, gpu_folder, residue = sys.argv[1:]
     asyncio.run(live(name, int(size), Path(gpu_folder), int(residue)))

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.forkserver import Child
+from tests.support.children import Child
 from tests.support.process import ArbiterProcess, vramctl
 from tests.support.stage import GIB, LAG_S, PATIENCE_S
 from tests.support.stage import Stage as OneDaemon
@@ -55,7 +55,7 @@ class Stage(OneDaemon):
 
 @pytest.fixture(scope="module")
 def all_cases() -> Iterator[Stage]:
-    made = Stage(Path(__file__).with_name("neighbour.py"), CONFIG)
+    made = Stage("neighbour", CONFIG)
     yield made
     made.close()
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.forkserver import ForkServer
+from tests.support.children import spawn
 from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
 
@@ -29,7 +29,6 @@ PATIENCE_S = 60
 GIB = 1 << 30
 TREE = Path(__file__).parents[2]
 UNIT = TREE / "configs" / "systemd" / "system" / "vram-arbiter.service"
-STEPPER = Path(__file__).with_name("stepper.py")
 
 
 class Service(ArbiterProcess):
@@ -129,28 +128,30 @@ def test_a_holder_outlives_the_service_with_its_lease(
     service: Service, number: signal.Signals
 ) -> None:
     service.start()
-    with ForkServer(STEPPER, service.environ, service.runtime / "errors.log") as forks:
-        holder = forks.spawn("holder", str(3 * GIB), str(service.gpu_folder), str(GIB // 2))
-        granted = holder.until("loading")
-        holder.tell("go")
-        holder.until("ready")
-        holder.tell("use")
-        holder.until("in_use")
-        assert service.process is not None
-        service.process.send_signal(number)
-        service.process.wait(PATIENCE_S)
-        assert holder.alive
-        assert (service.runtime / "run").exists()
+    holder = spawn(
+        "stepper", "holder", str(3 * GIB), str(service.gpu_folder), str(GIB // 2),
+        name="holder", environ=service.environ, errors=service.runtime / "errors.log",
+    )  # fmt: skip
+    granted = holder.until("loading")
+    holder.tell("go")
+    holder.until("ready")
+    holder.tell("use")
+    holder.until("in_use")
+    assert service.process is not None
+    service.process.send_signal(number)
+    service.process.wait(PATIENCE_S)
+    assert holder.alive
+    assert (service.runtime / "run").exists()
 
-        service.start()
-        status = status_when(service, lambda s: s["phase"] == "serving" and bool(s["leases"]))
-        (lease,) = status["leases"]
-        assert (lease["lease_id"], lease["token"]) == (granted["lease_id"], granted["token"])
-        assert (lease["state"], lease["uses"], lease["pid"]) == ("held", 1, holder.pid)
-        holder.tell("go")
-        holder.until("idle")
-        assert holder.alive, "neither lost nor fenced"
-        holder.close()
+    service.start()
+    status = status_when(service, lambda s: s["phase"] == "serving" and bool(s["leases"]))
+    (lease,) = status["leases"]
+    assert (lease["lease_id"], lease["token"]) == (granted["lease_id"], granted["token"])
+    assert (lease["state"], lease["uses"], lease["pid"]) == ("held", 1, holder.pid)
+    holder.tell("go")
+    holder.until("idle")
+    assert holder.alive, "neither lost nor fenced"
+    holder.close()
 
 
 # -- what the unit forbids

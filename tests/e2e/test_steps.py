@@ -10,11 +10,10 @@ left.
 import os
 import signal
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
-from tests.support.forkserver import Child
+from tests.support.children import Child
 from tests.support.stage import GIB
 from tests.support.stage import Stage as OneDaemon
 
@@ -39,7 +38,7 @@ class Stage(OneDaemon):
 
 @pytest.fixture(scope="module")
 def all_steps() -> Iterator[Stage]:
-    made = Stage(Path(__file__).with_name("stepper.py"), "lease: {fence_grace_s: 1.0}\n")
+    made = Stage("stepper", "lease: {fence_grace_s: 1.0}\n")
     yield made
     made.close()
 

@@ -12,6 +12,7 @@ import pytest
 
 from tests.support.field_server import PNG
 from vram_arbiter.clients.net.server import Peer, RouterServer
+from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.errors import BadRequest, FrameStale, GoalRejected, VramError
 from vram_arbiter.schemas.goals import (
     RUNNER_REQUEST,
@@ -220,3 +221,15 @@ def a_sidecar(tmp_path: Path) -> Callable[[str], AbstractAsyncContextManager[Sid
     return lambda rskill: _served(
         Sidecar(f"ipc://{tmp_path}/{rskill.replace('/', '-')}.sock", rskill)
     )
+
+
+@pytest.fixture
+async def runner(a_runner: Callable[[], AbstractAsyncContextManager[Runner]]) -> AsyncIterator[Any]:
+    async with a_runner() as made:
+        yield made
+
+
+@pytest.fixture
+async def client(runner: Runner) -> AsyncIterator[RunnerClient]:
+    async with RunnerClient(runner.endpoint) as made:
+        yield made

@@ -40,12 +40,11 @@ async def test_a_look_says_where_it_was_and_which_words_its_detector_does_not_kn
     assert "does not name pink" in outcome.text
 
 
-async def test_a_picture_for_the_planner_itself(a_runner: Any) -> None:
-    async with a_runner() as runner, RunnerClient(runner.endpoint) as client:
-        tools = Tools(client, None, None)
-        shown = await tools(Look(camera="wrist"))
-        runner.frame_error = FrameStale("too old")
-        shown, none = [shown, await tools(Look())]
+async def test_a_picture_for_the_planner_itself(runner: Any, client: RunnerClient) -> None:
+    tools = Tools(client, None, None)
+    shown = await tools(Look(camera="wrist"))
+    runner.frame_error = FrameStale("too old")
+    shown, none = [shown, await tools(Look())]
     assert (shown.status, none.status) == ("shown", "no_frame")
     assert shown.picture == PNG
     assert "wrist" in shown.text

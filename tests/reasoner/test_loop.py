@@ -126,27 +126,23 @@ async def test_a_result_passes_a_planner_that_hangs_and_makes_it_think_again() -
     assert result["notes"] == [{"source": "operator", "text": "how is it going?", "after": 0}]
 
 
-async def test_words_reach_a_thinking_planner_by_asking_it_again() -> None:
-    inbox = Inbox()
-    planner = Planner(lambda episode: Finish(False, "told to leave it") if episode.notes else None)
-    episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
-    await planner.hanging.wait()
-    inbox.put(Said("leave it"))
-    result = await episode
-    assert result["reason"] == "told to leave it"
-    assert (len(planner.asked), planner.dropped) == (2, 1)
-
-
-async def test_a_danger_that_stops_nothing_is_told_to_a_thinking_planner() -> None:
+@pytest.mark.parametrize(
+    ("message", "source"),
+    [(Said("leave it"), "operator"), (Danger("the front camera is stale", stop=False), "safety")],
+)
+async def test_news_reach_a_thinking_planner_by_asking_it_again(
+    message: Said | Danger, source: str
+) -> None:
     inbox = Inbox()
     planner = Planner(
         lambda episode: Finish(False, episode.notes[0].source) if episode.notes else None
     )
     episode = asyncio.create_task(run_episode("x", planner, PALETTE, Robot(), inbox=inbox))
     await planner.hanging.wait()
-    inbox.put(Danger("the front camera is stale", stop=False))
+    inbox.put(message)
     result = await episode
-    assert result["reason"] == "safety"
+    assert result["reason"] == source
+    assert (len(planner.asked), planner.dropped) == (2, 1)
 
 
 async def test_a_long_talk_is_forgotten_from_its_beginning() -> None:

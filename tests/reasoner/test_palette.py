@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vram_arbiter.reasoner.palette import EXECUTABLE_KINDS, OPERATOR, Palette, Skill, skills_of
@@ -168,24 +168,6 @@ def test_a_skill_for_another_robot_is_not_offered() -> None:
         palette(dog, body=ARM).first("grasp")
 
 
-def test_a_robot_that_does_not_say_what_it_is_gets_what_is_made_for_any() -> None:
-    found = palette(manifest_of("vla"), skill_for("so101_follower", name="lab/arm"))
-    assert list(found.executable) == ["lab/vla"]
-
-
-@pytest.mark.parametrize(("kg", "fits"), [(0.2, True), (0.25, True), (0.5, False)])
-def test_capabilities_count_by_value(kg: float, fits: bool) -> None:
-    """The defect of the field: any arm that can lift at all was offered skills that lift fifty
-    kilograms.
-    """
-    found = palette(
-        skill_for("any", name="lab/lift", needs=f"{{can_lift_kg: {kg}, has_vision: true}}"),
-        body=ARM,
-    )
-    assert (found.check(ExecuteRskill(rskill_id="lab/lift")) is None) == fits
-    assert bool(found.executable) == fits
-
-
 def test_a_model_for_another_robot_is_not_asked_either() -> None:
     eye = manifest_of("vlm")
     other = eye.model_copy(update={"embodiment_tags": ("go2",)})
@@ -297,10 +279,11 @@ JSON = st.recursive(
     lambda inner: (
         st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
     ),
-    max_leaves=12,
+    max_leaves=6,
 )
 
 
+@settings(max_examples=60)
 @given(
     schema=st.dictionaries(
         st.sampled_from(["type", "enum", "required", "properties", "items", "minimum", "minItems"]),

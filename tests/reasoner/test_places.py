@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from vram_arbiter.reasoner.search_map import Places, Point
+from vram_arbiter.reasoner.search_map import Places
 
 
 def look(base_pose: list[float] | None, *things: tuple[float, float, float]) -> dict[str, object]:
@@ -27,7 +27,7 @@ def test_scores_of_one_place_add_up_over_looks_from_different_places() -> None:
     assert (best.x, best.y) == pytest.approx((0.98, 0.01)), "told from the nearest look"
     assert len(places.known) == 2
     back = places.from_base(best)
-    assert (back.x, back.y, back.z) == pytest.approx((0.51, 0.02, 0.2))
+    assert back == pytest.approx((0.51, 0.02, 0.2))
 
 
 def test_two_things_of_one_look_are_two_places_however_near() -> None:
@@ -52,4 +52,4 @@ def test_what_says_no_more_than_a_point_is_a_place_of_its_own_look() -> None:
     best = places.best()
     assert best is not None
     assert not places.joined
-    assert places.from_base(best) == Point(0.3, 0.1, 0.2)
+    assert places.from_base(best) == (0.3, 0.1, 0.2)

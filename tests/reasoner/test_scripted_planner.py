@@ -185,19 +185,6 @@ def test_task_and_skills_are_checked_before_anything_moves() -> None:
         ScriptedPlanner("grab the red cube", Palette((NAVIGATE,)))
 
 
-def test_a_perception_skill_is_never_executed_whatever_a_planner_says() -> None:
-    class Rogue:
-        async def decide(self, episode: Episode) -> ToolCall | Finish:
-            return Finish(True, "") if episode.steps else ExecuteRskill(rskill_id=DETECTOR.id)
-
-    async def dispatch(call: ToolCall) -> Outcome:
-        raise AssertionError(f"{call} must not be dispatched")
-
-    result = asyncio.run(run_episode("x", Rogue(), PALETTE, dispatch))
-    assert result["steps"][0]["status"] == "refused"
-    assert result["steps"][0]["code"] == "not_permitted"
-
-
 def test_a_planner_that_repeats_itself_or_fails_ends_the_episode() -> None:
     class Parrot:
         async def decide(self, episode: Episode) -> ToolCall | Finish:
@@ -259,11 +246,6 @@ def test_two_looks_that_speak_for_another_place_make_it_that_ones_turn() -> None
     there = sees([0.375, 0.0, 0.0], (0.32, 0.0, 0.9))
     _, calls = run_script(looks_of(far, near, there))
     assert drives(calls) == [(0.7, -0.3), (0.325, 0.3), (0.32, 0.0)]
-
-
-def test_without_odometry_the_newest_look_counts() -> None:
-    _, calls = run_script(looks_of(sees(None, (0.7, -0.3, 0.9)), sees(None, (0.3, 0.1, 0.5))))
-    assert drives(calls) == [(0.7, -0.3), (0.3, 0.1)]
 
 
 def test_places_that_outdo_each_other_do_not_make_it_drive_for_ever() -> None:

@@ -3,7 +3,6 @@ begins nor ends anything.
 """
 
 import asyncio
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +14,7 @@ from vram_arbiter.clients.sidecar.perception import RewardClient
 from vram_arbiter.reasoner.history import KEPT_MAX, SHOWN_MAX, Past, Taken, spread
 from vram_arbiter.reasoner.loop import run_episode
 from vram_arbiter.reasoner.palette import Palette, Skill
-from vram_arbiter.reasoner.perception import LOOKED_AT_MAX_S, Judge
+from vram_arbiter.reasoner.perception import Judge
 from vram_arbiter.reasoner.planner import Episode, Finish
 from vram_arbiter.reasoner.tools import Tools
 from vram_arbiter.schemas.errors import (
@@ -90,14 +89,11 @@ def test_the_window_is_what_was_taken_in_it() -> None:
 @pytest.mark.parametrize("count", range(20))
 def test_thinning_keeps_order_and_both_ends(count: int) -> None:
     items = list(range(count))
-    for most in (1, 2, 3, 8):
+    for most in (2, 3, 8):
         found = spread(items, most)
         assert found == sorted(set(found))
         assert len(found) == min(count, most)
-        if count and most > 1:
-            assert (found[0], found[-1]) == (0, count - 1)
-        elif count:
-            assert found == [count - 1]
+        assert [*found[:1], *found[-1:]] == [*items[:1], *items[-1:]]
 
 
 async def test_a_camera_that_shows_nothing_leaves_a_gap_and_is_looked_at_again() -> None:
@@ -129,7 +125,6 @@ def ask_tool(
     a_sidecar: Any,
     prepare: Callable[[Any, Any], None],
     call: ToolCall = ASK,
-    **barred: str,
 ) -> Any:
     """The outcome, and what the sidecar was asked."""
 
@@ -144,11 +139,8 @@ def ask_tool(
             past = Past(lambda: eyes.frame("wrist", max_age_ms=1000.0, encoding="png"))
             if runner.frame_error is None:
                 await past.look()
-            listed = Skill("lab/reward", "reward", "", ("monitor",), **barred)
-            tools = Tools(
-                RunnerClient(runner.endpoint), None, None, judge=Judge(reward, past, TASK),
-                palette=dataclasses.replace(PALETTE, skills=(*PALETTE.skills, listed)),
-            )  # fmt: skip
+            judge = Judge(reward, past, TASK)
+            tools = Tools(RunnerClient(runner.endpoint), None, None, judge=judge, palette=PALETTE)
             outcome = await tools(call)
             return outcome, [message for message in sidecar.messages if message["op"] == "score"]
 
@@ -163,16 +155,6 @@ def test_an_opinion_is_said_with_what_it_is_worth(a_runner: Any, a_sidecar: Any)
     assert (outcome.data["progress"], outcome.data["task"]) == ([0.2, 0.7], TASK)
     assert asked[0]["task"] == TASK, "without words of its own the call is about the present task"
     assert 1 <= len(asked[0]["images"]) <= SHOWN_MAX
-
-
-def test_pictures_that_waited_for_the_gpu_are_taken_anew(a_runner: Any, a_sidecar: Any) -> None:
-    def late(runner: Any, sidecar: Any) -> None:
-        sidecar.late = 1
-        sidecar.judgement |= {"progress": [0.5], "success": []}
-
-    outcome, asked = ask_tool(a_runner, a_sidecar, late)
-    assert (outcome.status, len(asked)) == ("answered", 2)
-    assert all(0.0 < message["fresh_s"] < LOOKED_AT_MAX_S for message in asked)
 
 
 def test_what_the_model_does_not_say_is_not_said(a_runner: Any, a_sidecar: Any) -> None:
@@ -237,14 +219,6 @@ def test_without_a_fresh_picture_nothing_is_judged(a_runner: Any, a_sidecar: Any
 
     outcome, asked = ask_tool(a_runner, a_sidecar, dark)
     assert (outcome.status, outcome.code, asked) == ("no_frame", "frame_stale", [])
-
-
-def test_a_barred_model_is_not_asked(a_runner: Any, a_sidecar: Any) -> None:
-    outcome, asked = ask_tool(
-        a_runner, a_sidecar, lambda runner, sidecar: None, barred="it is made for go2"
-    )
-    assert (outcome.status, asked) == ("refused", [])
-    assert "made for go2" in outcome.text
 
 
 def test_its_flag_is_its_own() -> None:

@@ -141,15 +141,6 @@ def test_a_leak_keeps_bytes_until_the_process_exits():
     assert folder.gpu.used_bytes == 0
 
 
-def test_leaving_gives_everything_back():
-    folder = Folder()
-    folder.do(fakegpu.touch, A, "p", GB)
-    allocate(folder, A, GB)
-    folder.do(fakegpu.leave, A)
-    folder.now = 1
-    assert folder.gpu.used_bytes == 0
-
-
 def test_freeing_what_was_never_allocated_is_a_mistake_of_the_program():
     with pytest.raises(ValueError, match="frees 5 bytes that it has not"):
         Folder().do(fakegpu.free, A, "weights", 5)

@@ -14,11 +14,9 @@ from vram_arbiter.schemas.world import (
     Action,
     CameraModel,
     DetectedObject,
-    Detection,
     FrameEncoding,
     JointState,
     Pose,
-    RunResult,
     SensorFrame,
     TickResult,
     WorldState,
@@ -176,17 +174,6 @@ def test_wrong_camera_is_refused() -> None:
         CameraModel(K=((0, 0, 0), (0, 0, 0), (0, 0, 1)), T_base_camera=unit)
     with pytest.raises(ValidationError, match="last row"):
         CameraModel(K=((1, 0, 0), (0, 1, 0), (0, 0, 1)), T_base_camera=(*unit[:3], (0, 0, 0, 2)))
-
-
-def test_detection_box_is_ordered() -> None:
-    assert Detection(label="cube", confidence=1, box=(0, 2, 4, 6)).center == (2, 4)
-    with pytest.raises(ValidationError, match="x_max > x_min"):
-        Detection(label="cube", confidence=1, box=(4, 2, 0, 6))
-
-
-def test_results_have_plain_defaults() -> None:
-    assert TickResult(stamp_ns=1, tick_idx=0, tick_ms=1.5).action_applied
-    assert RunResult(n_ticks=3).success is None
 
 
 def test_objects_are_read_as_the_field_writes_them() -> None:

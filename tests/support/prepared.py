@@ -53,6 +53,7 @@ class Program:
     server: str = ""
 
 
+CLIENT = ("anyio._backends._asyncio", "vram_arbiter.clients.client")
 SIDECAR = (
     "anyio._backends._asyncio",
     "vram_arbiter.sidecars.host",
@@ -103,6 +104,9 @@ PROGRAMS: Mapping[str, Program] = {
     ),
     "vram-reasoner": Program("vram_arbiter.reasoner.__main__", server="vram-runner"),
     "deploy-nod": Program("tests.runner.deploy_nod", server="vram-runner"),
+    "neighbour": Program("tests.e2e.neighbour", CLIENT),
+    "stepper": Program("tests.e2e.stepper", server="neighbour"),
+    "storm-worker": Program("tests.chaos.worker", CLIENT),
     "op-server": Program("tests.support.server_process", server="echo"),
     "dataset-writer": Program("tests.support.dataset_writer", server="vram-sidecar"),
     "lerobot-train": Program("lerobot.scripts.lerobot_train", server="vram-sidecar"),
@@ -187,10 +191,12 @@ def start(
     user: int | None = None,
     passed: Sequence[int] = (),
     session: bool = False,
+    stdin: int | None = None,
 ) -> Forked:
     """Start one of PROGRAMS with its outputs in two open files, or for `communicate`; as another
     user if one is given, in a session of its own if `session`. It gets the descriptors `passed`
     under the same numbers."""
+    given = {number: number for number in passed} | ({} if stdin is None else {0: stdin})
     printed = [
         tempfile.TemporaryFile()  # noqa: SIM115  they live as long as the program
         for one in (output, errors)
@@ -200,13 +206,13 @@ def start(
     order = {
         "program": program, "arguments": list(arguments), "environ": dict(environ),
         "cwd": str(cwd or os.getcwd()), "user": user, "session": session,
-        "numbers": [1, 2, *passed],
+        "numbers": [1, 2, *given],
     }  # fmt: skip
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with there, _ORDERING:
         orders = _server(PROGRAMS[program].server or program)
         out, err = (next(files).fileno() if one is None else one for one in (output, errors))
-        descriptors = [there.fileno(), out, err, *passed]
+        descriptors = [there.fileno(), out, err, *given.values()]
         socket.send_fds(orders, [json.dumps(order).encode()], descriptors)
         pid, (pidfd, *_), _, _ = socket.recv_fds(orders, 16, 1)
     return Forked(int(pid), pidfd, here, printed)

@@ -1,11 +1,10 @@
-"""One daemon, a simulated GPU of 8 GiB and a fork server of consumers, for all tests of a file."""
+"""One daemon, a simulated GPU of 8 GiB and consumers, for all tests of a file."""
 
 import json
-from pathlib import Path
 from typing import Any
 
+from tests.support.children import Child, spawn
 from tests.support.fakegpu_check import check_log
-from tests.support.forkserver import Child, ForkServer
 from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
 from vram_arbiter.schemas import fakegpu
@@ -17,14 +16,14 @@ PATIENCE_S = 60.0
 
 
 class Stage:
-    """`program`: what its consumers run (`tests.support.forkserver`). A watcher subscribes to the
+    """`program`: what its consumers run (`tests.support.children`). A watcher subscribes to the
     events of the present case."""
 
-    def __init__(self, program: Path, config: str) -> None:
+    def __init__(self, program: str, config: str) -> None:
         self.arbiter = ArbiterProcess(config=config, prepared=True).start()
         self.configure(release_lag_s=LAG_S)
         self.errors = self.arbiter.runtime / "errors.log"
-        self.forks = ForkServer(program, self.arbiter.environ, self.errors)
+        self._program = program
         self.children: list[Child] = []
         self.watcher = self._subscribed()
 
@@ -55,7 +54,8 @@ class Stage:
     def begin(self, name: str, size: int, habits: str) -> Child:
         """Fork a consumer."""
         arguments = (name, str(size), str(self.arbiter.gpu_folder), habits)
-        self.children.append(self.forks.spawn(*arguments, name=name))
+        there: Any = {"name": name, "environ": self.arbiter.environ, "errors": self.errors}
+        self.children.append(spawn(self._program, *arguments, **there))
         return self.children[-1]
 
     def used_when(self, name: str) -> int:
@@ -80,7 +80,6 @@ class Stage:
     def close(self) -> None:
         """End all, and check the GPU's log."""
         self.watcher.close()
-        self.forks.close()
         report = check_log(self._log())
         self.arbiter.close()
         assert not report.problems

@@ -2,8 +2,6 @@
 is given up. No test waits: the pauses are only written down.
 """
 
-import subprocess
-import sys
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
 from typing import Any
@@ -11,6 +9,7 @@ from typing import Any
 import pytest
 
 from tests.support.llm_apis import PALETTE
+from vram_arbiter.reasoner import options
 from vram_arbiter.reasoner.llm.config import BUSY_S, LlmConfig
 from vram_arbiter.reasoner.llm.http import PAUSE_MAX_S, TRIES_MAX, retry_after_s
 from vram_arbiter.reasoner.planner import Episode
@@ -70,21 +69,17 @@ async def test_a_refused_try_counts_as_a_failed_request_and_fails_no_decision(
     assert (told["requests"], told["failed"], told["rejected"]) == (4, 3, 0)
 
 
-def test_httpx_is_imported_at_the_start() -> None:
+def test_httpx_is_imported_at_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: the first request imported it within its own time limit; on a busy machine that
     was most of it. Programs that ask no language model do not import it.
     """
-    script = (
-        "import sys\n"
-        "from vram_arbiter.reasoner.options import language_model, parser\n"
-        "assert 'httpx' not in sys.modules\n"
-        "flags = parser(None).parse_args(['--task', 'x', '--planner', 'openai'])\n"
-        "prefix = 'VRAM_REASONER_LLM_'\n"
-        "language_model(flags, {prefix + 'BASE_URL': 'http://x', prefix + 'MODEL': 'm'})\n"
-        "assert 'httpx' in sys.modules\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
-    assert done.returncode == 0, done.stderr.decode()
+    imported: list[str] = []
+    monkeypatch.setattr(options, "import_httpx", lambda: imported.append("httpx"))
+    environ = {f"VRAM_REASONER_LLM_{name}": "http://x" for name in ("BASE_URL", "MODEL")}
+    for planner, found in (("scripted", []), ("openai", ["httpx"])):
+        flags = options.parser(None).parse_args(["--task", "x", "--planner", planner])
+        options.language_model(flags, environ)
+        assert imported == found
 
 
 def test_a_pause_beyond_the_time_is_not_begun(stand_in: Any, decide: Any) -> None:

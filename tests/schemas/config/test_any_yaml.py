@@ -110,7 +110,7 @@ CASES = [
 ]
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(case=st.sampled_from(CASES), raw=st.sampled_from(VALUES))
 def test_any_value_at_any_key_is_read_or_found_fault_with(
     case: tuple[str, Any, tuple[Any, ...]], raw: str

@@ -1,30 +1,30 @@
 """A program's log as JSON: one object a line, with the ids of the present span."""
 
 import json
-import subprocess
-import sys
+import logging
+
+import pytest
+
+from vram_arbiter.schemas.runtime import logging as logs
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
 TRACE, SPAN = "0af7651916cd43dd8448eb211c80319c", "b7ad6b7169203331"
 
 
-def test_a_line_of_json_names_its_span() -> None:
-    code = (
-        "import logging\nfrom vram_arbiter.schemas.runtime import logging as "
-        "logs\nlogs.set_up('tool', 'info', 'json', '')\nlog = logging.getLogger('a')\n"
-        "log.info('before'); log.debug('hidden')\nfrom vram_arbiter.schemas.runtime.telemetry "
-        "import spans as tracing\n"
-        f"with tracing.joined('00-{TRACE}-{SPAN}-01'):\n    log.warning('%s\\nlines', 'two')\n"
-        "try: 1/0\nexcept ZeroDivisionError: log.exception('after')\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    before, within, after = [json.loads(line) for line in done.stderr.splitlines()]
-    assert (before["message"], before["level"], before["program"], before["logger"]) == (
-        "before",
-        "info",
-        "tool",
-        "a",
-    )
-    assert "trace_id" not in before
+def test_a_line_of_json_names_its_span(capsys: pytest.CaptureFixture[str]) -> None:
+    logs.set_up("tool", "info", "json", "")
+    log = logging.getLogger("a")
+    log.info("before")
+    log.debug("hidden")
+    with tracing.joined(f"00-{TRACE}-{SPAN}-01"):
+        log.warning("%s\nlines", "two")
+    try:
+        raise ZeroDivisionError
+    except ZeroDivisionError:
+        log.exception("after")
+    before, within, after = map(json.loads, capsys.readouterr().err.splitlines())
+    named = [before[key] for key in ("message", "level", "program", "logger")]
+    assert named == ["before", "info", "tool", "a"]
     assert (within["trace_id"], within["span_id"], within["message"]) == (TRACE, SPAN, "two\nlines")
     assert "ZeroDivisionError" in after["exception"]
-    assert "span_id" not in after
+    assert "trace_id" not in before | after

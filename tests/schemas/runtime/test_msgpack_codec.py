@@ -39,11 +39,11 @@ _VALUES = st.recursive(
     | st.builds(msgpack.ExtType, st.integers(0, 127), st.binary(max_size=20)),
     lambda inner: st.lists(inner, max_size=20) | st.dictionaries(st.text(max_size=8), inner,
     max_size=20),
-    max_leaves=30,
+    max_leaves=12,
 )  # fmt: skip
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=60)
 @given(_VALUES)
 def test_the_count_is_that_of_the_decoded_value(value: Any) -> None:
     """A count that reads a header otherwise than the decoder would let a bomb through, or refuse an

@@ -169,28 +169,6 @@ async def test_an_unmodified_peer_is_answered(
         await comes_true(lambda: len(handler.ended) == 1)
 
 
-async def test_an_identity_of_a_peer_names_nobody(path: Path) -> None:
-    """An identity equal to libzmq's next automatic routing id ended the daemon with `Assertion
-    failed`."""
-    ready = (
-        b"\x04\x2e\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER\x08Identity\x00\x00\x00\x05"
-        + bytes(4)
-        + b"\x01"
-    )
-
-    handler = Echo()
-    async with serving_router(path, handler):
-        raws = [
-            await (await Raw.connect(path, GREETING_AND_READY[:64] + ready)).ready()
-            for _ in range(3)
-        ]
-        assert [await raw.echo(b"%d" % n) for n, raw in enumerate(raws)] == [b"0", b"1", b"2"]
-        assert await asyncio.to_thread(ask_with_libzmq, path, zmq.DEALER, b"honest") == [b"honest"]
-        assert len(handler.open) >= 3
-        for raw in raws:
-            raw.close()
-
-
 @pytest.mark.parametrize(
     "attack",
     [

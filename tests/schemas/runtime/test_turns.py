@@ -11,22 +11,6 @@ def drained(turns: Turns[str]) -> list[str]:
     return [turns.pop() for _ in range(len(turns))]
 
 
-def test_users_alternate_however_many_items_one_of_them_has() -> None:
-    turns: Turns[str] = Turns()
-    for number in range(3):
-        turns.add(f"flood-{number}", (0, "p"))
-    turns.add("honest", (1, "q"))
-    assert drained(turns) == ["flood-0", "honest", "flood-1", "flood-2"]
-
-
-def test_processes_of_one_user_alternate_too() -> None:
-    turns: Turns[str] = Turns()
-    for number in range(2):
-        turns.add(f"flood-{number}", (0, "p"))
-    turns.add("honest", (0, "q"))
-    assert drained(turns) == ["flood-0", "honest", "flood-1"]
-
-
 def test_an_item_that_comes_again_waits_behind_its_neighbors() -> None:
     turns: Turns[str] = Turns()
     for item in "ab":
