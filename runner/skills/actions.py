@@ -1,7 +1,8 @@
 """A policy's action vector as commands of this robot.
 
 `ActionPlan.rows` turns a chunk into rows in m and rad, `numbers` turns them back; `Stepper.step`
-turns one row into joint targets and a body twist. Nothing here is a limit: every command passes the safety gate. `action_contract` makes the plans.
+turns one row into joint targets and a body twist. Nothing here is a limit: every command passes the
+safety gate. `action_contract` makes the plans.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ TRACE, PARENT = "0af7651916cd43dd8448eb211c80319c", "b7ad6b7169203331"
 
 
 @pytest.fixture(scope="module")
-def said() -> Any:
+def outcome() -> Any:
     """What the ticks of a program record."""
     runner = Path(__file__).parents[1]
     manifest = runner.parents[1] / "configs/rskills/so101-navigate/rskill.yaml"
@@ -31,8 +31,8 @@ def said() -> Any:
     return json.loads(done.stdout)
 
 
-def test_each_stage_of_a_tick_is_a_span_of_the_goals_trace(said: Any) -> None:
-    spans = said["spans"]
+def test_each_stage_of_a_tick_is_a_span_of_the_goals_trace(outcome: Any) -> None:
+    spans = outcome["spans"]
     assert {span["trace_id"] for span in spans} == {TRACE}
     first, *later = [span for span in spans if span["name"] == telemetry.SPAN_TICK]
     assert first["parent"] == PARENT
@@ -43,13 +43,13 @@ def test_each_stage_of_a_tick_is_a_span_of_the_goals_trace(said: Any) -> None:
         telemetry.SPAN_SAFETY,
         telemetry.SPAN_SEND,
     ]
-    assert said["tick"]["traceparent"] == f"00-{TRACE}-{first['span_id']}-01"
-    assert said["run"] == TRACE
+    assert outcome["tick"]["traceparent"] == f"00-{TRACE}-{first['span_id']}-01"
+    assert outcome["run"] == TRACE
     events = [event for span in later for event in span["events"]]  # its camera is gone
     assert events[:2] == [telemetry.EVENT_STALE, telemetry.EVENT_ACTION_WITHHELD]
     assert events.count(telemetry.EVENT_STALE) == 1
-    check_metrics(said["metrics"])
-    check_dashboard(*(promql.scrape(page) for page in said["pages"]))
+    check_metrics(outcome["metrics"])
+    check_dashboard(*(promql.scrape(page) for page in outcome["pages"]))
 
 
 def check_dashboard(*pages: promql.Scrape) -> None:
@@ -115,19 +115,19 @@ def check_metrics(metrics: dict[str, Any]) -> None:
     assert {metrics[name]["unit"] for name in durations} == {"s"}
 
 
-def test_a_share_of_a_goals_ticks_is_traced_from_its_first_tick_on(said: Any) -> None:
+def test_a_share_of_a_goals_ticks_is_traced_from_its_first_tick_on(outcome: Any) -> None:
     """The first action is always in the trace, then one tick in four; what is left out names the
     goal. Without a goal nothing is traced.
     """
-    said = said["some"]
-    assert said["idle_spans"] == 0
-    assert said["ticks"][:2] == [None, None]
-    assert said["ticks"][-1] is None
-    assert said["traces"] == [TRACE]
-    of_the_goal = [tuple(text.split("-")[1:]) for text in said["ticks"][2:-1]]
-    assert [span for _, span, flags in of_the_goal if flags == "01"] == said["tick_spans"]
+    outcome = outcome["some"]
+    assert outcome["idle_spans"] == 0
+    assert outcome["ticks"][:2] == [None, None]
+    assert outcome["ticks"][-1] is None
+    assert outcome["traces"] == [TRACE]
+    of_the_goal = [tuple(text.split("-")[1:]) for text in outcome["ticks"][2:-1]]
+    assert [span for _, span, flags in of_the_goal if flags == "01"] == outcome["tick_spans"]
     assert [flags for _, _, flags in of_the_goal] == [*(["01", "00", "00", "00"] * 2), "01"]
     assert {(trace, span) for trace, span, flags in of_the_goal if flags == "00"} == {
         (TRACE, PARENT)
     }
-    assert said["send_parents"] == said["tick_spans"]
+    assert outcome["send_parents"] == outcome["tick_spans"]

@@ -39,9 +39,9 @@ def make_video(tmp_path: Path) -> Callable[..., Path]:
 
 
 class RtspServer(ABC):
-    """A small RTSP server on loopback: one client after another, packets inside the connection (what
-    a firewall-friendly camera does). `media` are the SDP's lines of its stream, the port is 0. With
-    a password every client is refused.
+    """A small RTSP server on loopback: one client after another, packets inside the connection
+    (what a firewall-friendly camera does). `media` are the SDP's lines of its stream, the port
+    is 0. With a password every client is refused.
     """
 
     def __init__(self, media: str, password: str = "") -> None:
