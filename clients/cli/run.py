@@ -24,7 +24,7 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.actions import Action
 from vram_arbiter.clients.foreign.cuda_checkpoint import CheckpointAction, CudaDriver
 from vram_arbiter.clients.foreign.http import HttpAction, Request, checked_url
-from vram_arbiter.clients.foreign.program import STDERR, ForeignProgram, adopt_orphans
+from vram_arbiter.clients.foreign.program import adopt_orphans
 from vram_arbiter.clients.foreign.run_spec import OnRevoke, RunSpec, lease_spec
 from vram_arbiter.clients.foreign.say import say
 from vram_arbiter.clients.foreign.servers import SERVERS
@@ -222,32 +222,6 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
                 say(f"{program}: {error.strerror}")
                 return NOT_STARTED
             code = await supervisor.until_ended()
-    return code if code >= 0 else 128 - code
-
-
-async def run_alone(spec: RunSpec) -> int:
-    """Run a program without a lease, for its record alone. Returns its exit code."""
-    path = shutil.which(spec.command[0])
-    if path is None:
-        return _not_started(spec)
-    assert spec.record is not None, "nothing else is done without a lease"
-    await spec.record.begin()
-    environ = {**os.environ, **spec.environ}
-    try:
-        program = await ForeignProgram.start(path, spec.command[1:], environ, STDERR)
-    except OSError as error:
-        say(f"{path}: {error.strerror}")
-        return NOT_STARTED
-    with Forwarding(lambda number: None) as signals:
-        signals.to(program)
-        try:
-            async with asyncio.timeout(spec.limit_s):
-                code = await program.wait()
-        except TimeoutError:
-            await program.end(spec.grace_s)
-            code = 0
-        await program.end_orphans()
-    await spec.record.end()
     return code if code >= 0 else 128 - code
 
 
