@@ -9,6 +9,7 @@ import io
 import json
 import logging
 import unicodedata
+from argparse import Namespace
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -267,7 +268,7 @@ def test_doctor_quotes_what_the_arbiter_said(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: object
 ) -> None:
     monkeypatch.setenv("VRAM_ARBITER_ENDPOINT", f"ipc://{tmp_path}/{HOSTILE}".replace("\0", ""))
-    doctor.doctor(as_json=False, endpoint=None)
+    doctor.run(Namespace(as_json=False, endpoint=None))
     said = capsys.readouterr()
     assert "\\x1b]0;owned" in said.out
     assert not obeyed(said.out)
