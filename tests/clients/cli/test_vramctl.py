@@ -149,13 +149,10 @@ def test_help_uses_the_width_of_the_terminal(nowhere: dict[str, str]) -> None:
 
 
 @pytest.mark.e2e
-def test_doctor_says_where_the_product_lies(nowhere: dict[str, str]) -> None:
+def test_doctor_without_an_arbiter(nowhere: dict[str, str]) -> None:
     done = vramctl("doctor", "--json", environ=nowhere)
     findings = {one["code"]: one for one in json.loads(done.stdout)["findings"]}
     assert done.returncode == 3
-    root = Path(__file__).parents[3]
-    assert findings["installation.origin"]["severity"] == "ok"
-    assert str(root / "src/vram_arbiter") in findings["installation.origin"]["found"]
     assert findings["socket.missing"]["severity"] == "error"
 
 

@@ -16,6 +16,7 @@ import pytest
 from tests.support.prepared import Forked, start
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.reasoner.server import send
+from vram_arbiter.schemas.goals import GetResult
 
 pytestmark = [pytest.mark.anyio, pytest.mark.heavy, pytest.mark.e2e]
 
@@ -135,7 +136,7 @@ async def test_results_signals_and_an_emergency_stop_pass_a_model_that_hangs(
             result = programs.result()
             assert result["reason"] == "canceled: by SIGTERM"
             assert [step["status"] for step in result["steps"]] == ["canceled"]
-            assert (await client.call("result", {"goal_id": running}))["status"] == "canceled"
+            assert (await client.call(GetResult(goal_id=running)))["status"] == "canceled"
             assert await goal() is None
 
             # an emergency stop ends an episode whose model hangs

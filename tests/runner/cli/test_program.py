@@ -57,8 +57,8 @@ def test_a_signal_ends_it_in_order_and_the_video_is_whole(
 
     async def use() -> None:
         async with RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=60.0) as client:
-            assert (await client.call("ping"))["pid"] == process.pid
-            frame = await client.call("frame", {"encoding": "png", "max_age_ms": 60_000.0})
+            assert (await client.ping())["pid"] == process.pid
+            frame = await client.frame(encoding="png", max_age_ms=60_000.0)
             assert frame["data"].startswith(b"\x89PNG")
             truth = await client.ground_truth()
             assert truth["target"] in truth["objects"]
