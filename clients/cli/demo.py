@@ -27,7 +27,6 @@ from vram_arbiter.clients.cli.demo_report import (
     MemoryStory,
     draw_timeline,
     read_log,
-    read_samples,
     summarise,
 )
 from vram_arbiter.clients.client import AsyncClient
@@ -38,7 +37,7 @@ from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import RunnerUnreachable, SidecarUnavailable
-from vram_arbiter.schemas.plain import JsonMap, JsonObject
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE, RUNTIME_VARIABLE
 from vram_arbiter.schemas.runtime.extras import need
@@ -69,7 +68,7 @@ class Watch:
     start_s: float
     wall_offset_s: float  # wall clock minus monotonic clock
     events: list[JsonObject] = field(default_factory=list)
-    samples: list[tuple[float, JsonMap]] = field(default_factory=list)
+    measured: list[tuple[float, int]] = field(default_factory=list)
     capacity_bytes: int = 0
 
 
@@ -239,7 +238,8 @@ async def _episode(
         f"{summary['oom_events']} out-of-memory"
     )
     draw_timeline(
-        out / "timeline.png", story, capacity, watch.events, start_s=watch.start_s,
+        out / "timeline.png", story, capacity, watch.events,
+        watch.measured if gpu == "nvml" else (), start_s=watch.start_s,
         wall_offset_s=watch.wall_offset_s,
         title=title + ("" if arbiter else " (no arbiter)"),
     )  # fmt: skip
@@ -366,8 +366,9 @@ async def _look(client: AsyncClient | None, display: Display, watch: Watch) -> N
     if client is None:
         return
     status = to_map(await client.status())
-    watch.samples += [(time.monotonic(), gpu) for gpu in status["gpus"]]
-    watch.capacity_bytes = status["gpus"][0]["capacity_bytes"]
+    gpu = status["gpus"][0]
+    watch.measured.append((time.monotonic(), gpu["measured_used_bytes"] or 0))
+    watch.capacity_bytes = gpu["capacity_bytes"]
     after = watch.events[-1]["seq"] if watch.events else 0
     for event in (await client.history(after=after)).events:
         watch.events.append(dict(event))
@@ -386,5 +387,7 @@ def _last_line(program: Program) -> str:
 
 def _story(folder: Path, gpu: str, names: Mapping[int, str], watch: Watch) -> MemoryStory:
     if gpu == "nvml":
-        return read_samples(watch.samples, names, watch.events, watch.wall_offset_s)
+        refused = (event["at_wall_s"] for event in watch.events if event["kind"] == "oom")
+        peak_bytes = max((used for _, used in watch.measured), default=0)
+        return MemoryStory((), peak_bytes, tuple(at_s - watch.wall_offset_s for at_s in refused))
     return read_log((folder / fakegpu.LOG_FILE).read_text(), names)

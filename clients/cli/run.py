@@ -10,7 +10,6 @@ What happens on an eviction is `clients.foreign`'s; docs/how-to/foreign-programs
 
 import argparse
 import asyncio
-import os
 import shutil
 from collections.abc import Sequence
 from typing import Final
@@ -202,7 +201,8 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
     ArbiterUnreachable, CheckpointUnsupported, ConfigError; with a record also CalibrationFailed."""
     program = shutil.which(spec.command[0])
     if program is None:
-        return _not_started(spec)
+        say(f"{spec.command[0]}: not found, or not a file that may be executed")
+        return NOT_FOUND
     if spec.action is not None:
         spec.action.check()
     if spec.comes_back:
@@ -232,19 +232,3 @@ def check_gpus(wanted: str, gpus: Sequence[GpuView]) -> None:
             f"there are {len(gpus)} GPUs, and the program must return to the one it was started on",
             hint="name one with --gpu",
         )
-
-
-def _not_started(spec: RunSpec) -> int:
-    """Say why a command is not an executable file. Returns the exit code."""
-    command = spec.command[0]
-    folders = [""] if os.sep in command else os.environ.get("PATH", os.defpath).split(os.pathsep)
-    found = [
-        path
-        for folder in folders
-        if command and os.path.exists(path := os.path.join(folder, command))
-    ]
-    if not found:
-        say(f"{command}: not found")
-        return NOT_FOUND
-    say(f"{command}: {'is a directory' if os.path.isdir(found[0]) else 'permission denied'}")
-    return NOT_STARTED
