@@ -454,13 +454,10 @@ class Session:
             self.protocol.holdings.release(event.record, False, self.now(), REQUEST_TIMEOUT_S)
             return
         lease = AsyncLease(self, event.record, wait.spec, wait.handlers)
-        self._leases[lease.lease_id] = lease
-        self.spawn(self._forget_when_over, lease, name=f"life of {lease.lease_id}")
+        kept = (one for one in self._leases.values() if not one._departure.over)
+        self._leases = {one.lease_id: one for one in kept}
+        self._leases[event.record.lease_id] = lease
         wait.granted.set(lease)
-
-    async def _forget_when_over(self, lease: AsyncLease) -> None:
-        await lease.wait_gone()
-        self._leases.pop(lease.lease_id, None)
 
 
 def closed() -> ArbiterUnreachable:
