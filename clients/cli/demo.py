@@ -61,6 +61,17 @@ LOOP_S = (
 POLL_S = 0.2
 
 
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """What is run: `gpu` is `nvml` or `fake:SIZE`; `http`: where a status page is served."""
+
+    seed: int
+    arbiter: bool
+    gpu: str
+    out: Path
+    http: HttpAddress | None = None
+
+
 @dataclass(slots=True)
 class Watch:
     """What was seen while the loop ran."""
@@ -145,24 +156,22 @@ def run(args: argparse.Namespace) -> int:
     packages = ("torch", "lerobot", "transformers", "mujoco", "cv2", "matplotlib")
     need("the demo", *packages, extra="all")
     out: Path = args.out
-    summary = asyncio.run(_demo(args.seed, arbiter, args.gpu, args.http, out))
+    summary = asyncio.run(_demo(Episode(args.seed, arbiter, args.gpu, out, args.http)))
     print(json.dumps({key: value for key, value in summary.items() if key != "loads"}, indent=2))
     print(f"written: {out}/summary.json, {out}/timeline.png, {out}/episode.mp4")
     oom = summary["oom_events"] > 0
     return 0 if (summary["completed"] and not oom if arbiter else oom) else 1
 
 
-async def _demo(
-    seed: int, arbiter: bool, gpu: str, http: HttpAddress | None, out: Path
-) -> JsonObject:
-    shutil.rmtree(out, ignore_errors=True)
-    (out / "logs").mkdir(parents=True)
+async def _demo(what: Episode) -> JsonObject:
+    shutil.rmtree(what.out, ignore_errors=True)
+    (what.out / "logs").mkdir(parents=True)
     runtime = Path(
         tempfile.mkdtemp(prefix="vram-demo-")
     )  # short: ipc paths have at most 107 characters
     try:
         programs = Programs(
-            out / "logs",
+            what.out / "logs",
             {
                 RUNTIME_VARIABLE: str(runtime),
                 ENDPOINT_VARIABLE: f"ipc://{runtime}/arbiter.sock",  # not the machine's own
@@ -171,42 +180,22 @@ async def _demo(
             },
         )
         try:
-            return await _episode(
-                programs, runtime, seed=seed, arbiter=arbiter, gpu=gpu, http=http, out=out
-            )
+            return await _episode(programs, runtime, what)
         finally:
             await programs.stop_all()
     finally:
         shutil.rmtree(runtime, ignore_errors=True)
 
 
-async def _episode(
-    programs: Programs,
-    runtime: Path,
-    *,
-    seed: int,
-    arbiter: bool,
-    gpu: str,
-    http: HttpAddress | None,
-    out: Path,
-) -> JsonObject:
+async def _episode(programs: Programs, runtime: Path, what: Episode) -> JsonObject:
+    gpu, out, arbiter = what.gpu, what.out, what.arbiter
     folder = runtime / "fakegpu"
     if gpu.startswith("fake:"):
         make_gpu(folder, parse_bytes(gpu.removeprefix("fake:")))
     watch = Watch(time.monotonic(), time.time() - time.monotonic())
     async with contextlib.AsyncExitStack() as stack:
         runner = await stack.enter_async_context(RunnerClient(f"ipc://{runtime}/runner.sock"))
-        client = await boot(
-            programs,
-            runtime,
-            runner,
-            stack,
-            seed=seed,
-            arbiter=arbiter,
-            gpu=gpu,
-            http=http,
-            out=out,
-        )
+        client = await boot(programs, runtime, runner, stack, what)
         target = (await runner.ground_truth())["target"]
         task = f"grab the {target}"
         watch.start_s = time.monotonic()
@@ -228,7 +217,7 @@ async def _episode(
     )
     capacity = watch.capacity_bytes or parse_bytes(gpu.removeprefix("fake:"))
     summary = summarise(
-        seed=seed, arbiter=arbiter, task=task, story=story, capacity_bytes=capacity,
+        seed=what.seed, arbiter=arbiter, task=task, story=story, capacity_bytes=capacity,
         events=watch.events, reasoner=outcome, truth=truth,
         target=target, seconds=seconds,
     )  # fmt: skip
@@ -264,15 +253,11 @@ async def boot(
     runtime: Path,
     runner: RunnerClient,
     stack: contextlib.AsyncExitStack,
-    *,
-    seed: int,
-    arbiter: bool,
-    gpu: str,
-    out: Path,
-    http: HttpAddress | None = None,
+    what: Episode,
 ) -> AsyncClient | None:
     """Start everything and wait until each answers. The arbiter's client, if there is an
     arbiter."""
+    gpu, arbiter = what.gpu, what.arbiter
     print(
         f"starting {'the arbiter, ' if arbiter else ''}three sidecars and the runner (imports take "
         "a while) …"
@@ -284,21 +269,23 @@ async def boot(
         config = runtime / "arbiter.yaml"
         # a larger real GPU is budgeted like the small one
         config.write_text(f'gpu:\n  capacity_bytes: {{"0": {BUDGET}}}\n')
-        page = [] if http is None else ["--http", str(http)]
+        page = [] if what.http is None else ["--http", str(what.http)]
         await programs.start("arbiter", "arbiter", "--gpu", source, "--config", str(config), *page)
         client = await stack.enter_async_context(_arbiter_client(runtime))
         top = f"{_vramctl()} top --endpoint ipc://{runtime}/arbiter.sock"
         print(f"live in another terminal: {top}")
-        if http is not None:
-            print(f"status page: http://{http}")
+        if what.http is not None:
+            print(f"status page: http://{what.http}")
     device = "cuda" if gpu == "nvml" else f"fake:{runtime}/fakegpu"
     for name, rskill in SIDECARS.items():
         manifest = str(configs_folder(os.environ) / "rskills" / rskill / "rskill.yaml")
         await programs.start(
             name, "sidecars", "--name", name, "--rskill", manifest, "--device", device, *without
         )
-    video = str((out / "episode.mp4").resolve())
-    await programs.start("runner", "runner", "sim", "--seed", str(seed), "--video", video, *without)
+    video = str((what.out / "episode.mp4").resolve())
+    await programs.start(
+        "runner", "runner", "sim", "--seed", str(what.seed), "--video", video, *without
+    )
     endpoints = {name: f"ipc://{runtime}/{name}.sock" for name in SIDECARS}
     sidecars = [
         DetectorClient(endpoints["detector"]),
