@@ -11,7 +11,6 @@ import logging
 import os
 import time
 import uuid
-from collections import deque
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import dataclass
 from types import TracebackType
@@ -19,6 +18,7 @@ from typing import Final, Self, cast
 
 import anyio
 from anyio.abc import TaskGroup
+from anyio.streams.memory import MemoryObjectReceiveStream, MemoryObjectSendStream
 
 from vram_arbiter.clients import use_context
 from vram_arbiter.clients._protocol import records as r
@@ -39,6 +39,8 @@ from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 log = logging.getLogger(__name__)
 
+type _Events = tuple[MemoryObjectSendStream[JsonMap], MemoryObjectReceiveStream[JsonMap]]
+
 BYE_TIMEOUT_S: Final = 1.0
 LEAVE_TIMEOUT_S: Final = 30.0  # as long as the arbiter's own ladder gives a holder
 REOPEN_S: Final = (
@@ -56,31 +58,6 @@ class _Wait:
     handlers: Handlers[AsyncLease]
 
 
-class _Subscriber:
-    """Events that a subscriber has not read yet."""
-
-    def __init__(self) -> None:
-        self._events: deque[JsonMap] = deque(maxlen=SUBSCRIBER_QUEUE_MAX)
-        self._arrived = anyio.Event()
-        self._closed = False
-
-    def close(self) -> None:
-        self._closed = True
-        self._arrived.set()
-
-    def put(self, event: JsonMap) -> None:
-        self._events.append(event)
-        self._arrived.set()
-
-    async def get(self) -> JsonMap:
-        while not self._events:
-            self._arrived = anyio.Event()
-            if self._closed:
-                raise closed()
-            await self._arrived.wait()
-        return self._events.popleft()
-
-
 class Session:
     """Open inside `async with`, for one event loop and one process (`clients.eviction.Driver`)."""
 
@@ -93,7 +70,7 @@ class Session:
         self._waits: dict[str, _Wait] = {}
         self._leases: dict[str, AsyncLease] = {}
         self._foreign_uses: dict[str, AsyncForeignUse] = {}
-        self._subscribers: list[_Subscriber] = []
+        self._subscribers: list[_Events] = []
         self._connect_timeout_s = connect_timeout_s
         self._open = False
         self._closing = False
@@ -219,14 +196,18 @@ class Session:
 
     async def events(self) -> AsyncGenerator[JsonMap]:
         """Yield history events from now on."""
-        subscriber = _Subscriber()
-        self._subscribers.append(subscriber)
+        unread = anyio.create_memory_object_stream[JsonMap](SUBSCRIBER_QUEUE_MAX)
+        put, read = unread
+        self._subscribers.append(unread)
         try:
-            await self.reply(self.protocol.subscribe(self.now()))
-            while True:
-                yield await subscriber.get()
+            with put, read:
+                await self.reply(self.protocol.subscribe(self.now()))
+                async for event in read:
+                    yield event
+                raise closed()
         finally:
-            self._subscribers.remove(subscriber)
+            if unread in self._subscribers:
+                self._subscribers.remove(unread)
 
     # -- for leases (`clients.eviction.Driver`)
     def check_open(self) -> None:
@@ -362,8 +343,9 @@ class Session:
             answer.fail(closed())
         for wait in self._waits.values():
             wait.granted.fail(closed())
-        for subscriber in self._subscribers:
-            subscriber.close()
+        subscribers, self._subscribers = self._subscribers, []
+        for put, _ in subscribers:
+            put.close()
         for scope in tuple(self._spawned.values()):  # one by one, in order: a simulation repeats
             scope.cancel()
         tasks, self._tasks = self._tasks, None
@@ -443,8 +425,10 @@ class Session:
                 if use := self._foreign_uses.get(event.use_id):
                     use._lost = event.error
             case r.HistoryEvent():
-                for subscriber in self._subscribers:
-                    subscriber.put(event.event)
+                for put, read in self._subscribers:
+                    if put.statistics().current_buffer_used == SUBSCRIBER_QUEUE_MAX:
+                        read.receive_nowait()
+                    put.send_nowait(event.event)
             case r.PrepareAsked():
                 if self.on_prepare is not None:
                     self.on_prepare(event.by)
@@ -470,13 +454,10 @@ class Session:
             self.protocol.holdings.release(event.record, False, self.now(), REQUEST_TIMEOUT_S)
             return
         lease = AsyncLease(self, event.record, wait.spec, wait.handlers)
-        self._leases[lease.lease_id] = lease
-        self.spawn(self._forget_when_over, lease, name=f"life of {lease.lease_id}")
+        kept = (one for one in self._leases.values() if not one._departure.over)
+        self._leases = {one.lease_id: one for one in kept}
+        self._leases[event.record.lease_id] = lease
         wait.granted.set(lease)
-
-    async def _forget_when_over(self, lease: AsyncLease) -> None:
-        await lease.wait_gone()
-        self._leases.pop(lease.lease_id, None)
 
 
 def closed() -> ArbiterUnreachable:

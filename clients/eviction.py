@@ -207,35 +207,34 @@ class Departure:
 
     # -- steps -------------------------------------------------------------------------------------
     async def _leave(self, left: anyio.Event) -> None:
-        try:
-            await self._leave_at_safe_point(left)
-        finally:
-            left.set()
-
-    async def _leave_at_safe_point(self, left: anyio.Event) -> None:
         """1. Wait for the safe point: no use of the holder, not loading.
         2. Announce it, until no other process uses the lease. 3. Unload, or park. 4. Release.
         A lease that may come back is asleep then; any other is over. If the revoke is withdrawn
         before the unloading begins, the lease stays."""
-        token = self._record.token
-        while not self.gone and self._left is left and not self.stay_if_withdrawn():
-            if self.uses or not (self._record.held or self.own_will):  # 1
-                await self.progress.wait()
-            elif not self._record.held or await self._announced():  # 2
-                self.unloading = True
-                asleep = await self._clear_the_gpu()  # 3
-                if not self.gone:
-                    try:
-                        await self._release(exiting=False, asleep=asleep)  # 4
-                    except VramError as error:  # nothing is held; its TTL ends the lease there
-                        log.warning("%s: its release was refused: %s", self._record.lease_id, error)
-                if self._record.token != token:
-                    return  # granted again before this task saw the answer to its release
-                if self.gone or not self._record.asleep:
-                    self.end()
-                self.unloading = False
-                self.progress.changed()
-                return
+        try:
+            token = self._record.token
+            while not self.gone and self._left is left and not self.stay_if_withdrawn():
+                if self.uses or not (self._record.held or self.own_will):  # 1
+                    await self.progress.wait()
+                elif not self._record.held or await self._announced():  # 2
+                    self.unloading = True
+                    asleep = await self._clear_the_gpu()  # 3
+                    if not self.gone:
+                        try:
+                            await self._release(exiting=False, asleep=asleep)  # 4
+                        except VramError as error:  # nothing is held; its TTL ends the lease there
+                            log.warning(
+                                "%s: its release was refused: %s", self._record.lease_id, error
+                            )
+                    if self._record.token != token:
+                        return  # granted again before this task saw the answer to its release
+                    if self.gone or not self._record.asleep:
+                        self.end()
+                    self.unloading = False
+                    self.progress.changed()
+                    return
+        finally:
+            left.set()
 
     async def _clear_the_gpu(self) -> str:
         """Free the bytes. Returns how the lease waits for its return ("": it is over)."""

@@ -32,35 +32,27 @@ class Cursor:
     """
 
     def __init__(self, read: Mapping[str, int]) -> None:
-        self._read = dict(read)
-        self._current = next(reversed(self._read), "")
-
-    @property
-    def read(self) -> Mapping[str, int]:
-        return self._read
-
-    @property
-    def numbering(self) -> str:
-        return self._current
+        self.read = dict(read)
+        self.numbering = next(reversed(self.read), "")
 
     @property
     def after(self) -> int:
-        return self._read.get(self._current, 0)
+        return self.read.get(self.numbering, 0)
 
     def take(self, reply: HistoryReply) -> Sequence[JsonMap] | None:
         """Return the new events of an answer to `history` after `after`; None: ask again, the
         numbering is another one."""
-        if reply.numbering != self._current or not self._read:
+        if reply.numbering != self.numbering or not self.read:
             # at the very first start: the events from now on
-            known = self._read.pop(reply.numbering, 0) if self._read else reply.last_seq
-            self._read[reply.numbering] = known
-            self._current = reply.numbering
-            while len(self._read) > NUMBERINGS_MAX:
-                del self._read[next(iter(self._read))]
+            known = self.read.pop(reply.numbering, 0) if self.read else reply.last_seq
+            self.read[reply.numbering] = known
+            self.numbering = reply.numbering
+            while len(self.read) > NUMBERINGS_MAX:
+                del self.read[next(iter(self.read))]
             return None
         events = [event for event in reply.events if event["seq"] > self.after]
         if events:
-            self._read[self._current] = events[-1]["seq"]
+            self.read[self.numbering] = events[-1]["seq"]
         return events
 
 

@@ -10,6 +10,7 @@ import os
 import uuid
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Literal, Self, cast
 
 from vram_arbiter.clients._protocol import traces
@@ -21,6 +22,20 @@ from vram_arbiter.schemas.errors import (
     GoalRejected,
     RunnerUnreachable,
     from_wire,
+)
+from vram_arbiter.schemas.goals import (
+    CancelGoal,
+    GetFrame,
+    GetGroundTruth,
+    GetResult,
+    GetSkills,
+    GetState,
+    MarkEpisode,
+    PingRunner,
+    ResetWorld,
+    RunnerRequest,
+    SendGoal,
+    ShutdownRunner,
 )
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint
@@ -77,7 +92,7 @@ class Goal:
 
     async def cancel(self) -> None:
         """Ask for the end; the result (status `canceled`) still comes."""
-        await self._client.ask_about(self.goal_id, "cancel")
+        await self._client.ask_about(CancelGoal(goal_id=self.goal_id))
 
     def fed(self, push: FeedbackPush) -> None:
         if self._feedback.qsize() >= FEEDBACK_MAX:
@@ -166,22 +181,19 @@ class RunnerClient:
         goal = self._goals[name] = Goal(
             self, name
         )  # before the answer: pushes may come right behind it
-        fields: Message = {
-            "goal_id": name,
-            "rskill_id": rskill_id,
-            "revision": revision,
-            "prompt": prompt,
-            "goal_params": dict(goal_params or {}),
-            "deadline_s": deadline_s,
-        }
-        if session:
-            fields["session"] = session
-        if max_ticks is not None:
-            fields["max_ticks"] = max_ticks
-        if traceparent := traceparent or traces.present():
-            fields["traceparent"] = traceparent
+        request = SendGoal(
+            goal_id=name,
+            rskill_id=rskill_id,
+            session=session,
+            revision=revision,
+            prompt=prompt,
+            goal_params=goal_params or {},
+            deadline_s=deadline_s,
+            max_ticks=max_ticks,
+            traceparent=traceparent or traces.present(),
+        )
         try:
-            await self.call("goal", fields)
+            await self.call(request)
         except BaseException:
             del self._goals[name]
             raise
@@ -190,13 +202,13 @@ class RunnerClient:
     async def check_result(self, goal: Goal) -> None:
         """Ask for a result that may have passed us by while contact was lost."""
         try:
-            reply = await self.ask_about(goal.goal_id, "result")
+            reply = await self.ask_about(GetResult(goal_id=goal.goal_id))
         except BadState:
             return  # it runs; the error of a runner that forgot the goal is the caller's
         if reply.get("status") in ENDED:
             self._end(cast("ResultPush", reply))
 
-    async def ask_about(self, goal_id: str, op: str) -> Message:
+    async def ask_about(self, request: CancelGoal | GetResult) -> Message:
         """Ask the runner that accepted the goal: another one that starts does not know it.
 
         Raises RunnerUnreachable at once where no process serves the socket any more.
@@ -207,11 +219,11 @@ class RunnerClient:
             if not is_listening(self.endpoint):
                 raise self._lost("it has ended")
             try:
-                await self._exchange("ping", {}, RESULT_POLL_S)
+                await self._exchange(PingRunner(), RESULT_POLL_S)
             except RunnerUnreachable:
                 if loop.time() > deadline_s:
                     raise
-        return await self.call(op, {"goal_id": goal_id})
+        return await self.call(request)
 
     # -- reads -------------------------------------------------------------------------------------
     async def frame(
@@ -222,34 +234,34 @@ class RunnerClient:
         encoding: Literal["jpeg", "png"] = "jpeg",
     ) -> FrameReply:
         """Latest frame ("" takes the first camera). Raises FrameStale when none is young enough."""
-        fields = {"camera": camera, "max_age_ms": max_age_ms, "encoding": encoding}
-        return cast("FrameReply", await self.call("frame", fields))
+        request = GetFrame(camera=camera, max_age_ms=max_age_ms, encoding=encoding)
+        return cast("FrameReply", await self.call(request))
 
     async def state(self) -> Message:
-        return await self.call("state")
+        return await self.call(GetState())
 
     async def ground_truth(self) -> Message:
         """Simulator only: what is really there. For judges, never for planners."""
-        return await self.call("ground_truth")
+        return await self.call(GetGroundTruth())
 
     async def skills(self) -> Message:
-        return await self.call("skills")
+        return await self.call(GetSkills())
 
     async def reset(self, seed: int | None = None) -> Message:
         """Simulator only: begin the scene again, or that of `seed`; returns once it stands.
 
         Raises BadState while a goal runs."""
-        return await self.call("reset", {"seed": seed}, timeout_s=RESET_TIMEOUT_S)
+        return await self.call(ResetWorld(seed=seed), timeout_s=RESET_TIMEOUT_S)
 
     async def mark(self, verdict: Verdict, goal_id: str = "") -> Message:
         """Mark the episode of the goal that runs, or of the last one; "discard" removes it.
 
         Raises BadState when nothing is recorded, BadRequest for another goal."""
-        fields = {"verdict": verdict, "goal_id": goal_id}
-        return await self.call("mark", fields, timeout_s=MARK_TIMEOUT_S)
+        request = MarkEpisode(verdict=verdict, goal_id=goal_id)
+        return await self.call(request, timeout_s=MARK_TIMEOUT_S)
 
     async def ping(self, *, timeout_s: float = 1.0) -> Message:
-        return await self._exchange("ping", {}, timeout_s)
+        return await self._exchange(PingRunner(), timeout_s)
 
     async def estop(self, reason: str = "") -> Stopped:
         """Emergency stop, on its own socket and a thread of its own. Returns once the motors have
@@ -264,38 +276,34 @@ class RunnerClient:
             executor.shutdown(wait=False)
 
     async def shutdown(self) -> None:
-        await self._exchange("shutdown", {}, self._timeout_s)
+        await self._exchange(ShutdownRunner(), self._timeout_s)
 
-    async def call(
-        self, op: str, fields: JsonMap | None = None, *, timeout_s: float | None = None
-    ) -> Message:
-        """Any op of `schemas.goals`. Raises its typed error, RunnerUnreachable, or UntrustedServer
-        before anything is said."""
+    async def call(self, request: RunnerRequest, *, timeout_s: float | None = None) -> Message:
+        """Any request of `schemas.goals`. Raises its typed error, RunnerUnreachable, or
+        UntrustedServer before anything is said."""
         if not self._rpc.proven:
             await self._await_runner()
-        return await self._exchange(
-            op, fields or {}, self._timeout_s if timeout_s is None else timeout_s
-        )
+        return await self._exchange(request, self._timeout_s if timeout_s is None else timeout_s)
 
     # -- steps -------------------------------------------------------------------------------------
     async def _await_runner(self) -> None:
         """Wait until a runner answers: one that is starting does not serve yet."""
         quiet_s = min(WAIT_QUIETLY_S, self._connect_timeout_s)
         try:
-            await self._exchange("ping", {}, quiet_s)
+            await self._exchange(PingRunner(), quiet_s)
         except RunnerUnreachable:
             rest_s = self._connect_timeout_s - quiet_s
             if rest_s <= 0:
                 raise
             log.warning("waiting for a runner at %s, %.0f s more", self.endpoint, rest_s)
-            await self._exchange("ping", {}, rest_s)
+            await self._exchange(PingRunner(), rest_s)
 
-    async def _exchange(self, op: str, fields: JsonMap, timeout_s: float) -> Message:
+    async def _exchange(self, request: RunnerRequest, timeout_s: float) -> Message:
         try:
-            reply: Message = await self._rpc.exchange({"op": op, **fields}, timeout_s)
+            reply: Message = await self._rpc.exchange(asdict(request), timeout_s)
         except TimeoutError:
             raise RunnerUnreachable(
-                f"no runner answers {op} at {self.endpoint} within {timeout_s:g} s",
+                f"no runner answers {request.op} at {self.endpoint} within {timeout_s:g} s",
                 hint="start `vram-runner`, or see its log",
             ) from None
         if not reply.get("ok"):

@@ -34,18 +34,13 @@ def leave(use_id: str) -> None:
     _running.pop(use_id, None)
 
 
-def inside() -> tuple[str, ...]:
-    """Return the names of the uses that the caller is inside of."""
-    return tuple(sorted(_running[use_id] for use_id in _entered.get() & _running.keys()))
-
-
 @contextmanager
 def bounded(consumer: str, wait_timeout_s: float | None) -> Iterator[float | None]:
     """Bound a wait that has no limit of its own where the caller is inside a use; yield its limit.
 
     Raises: WouldDeadlock when that bound ends the wait.
     """
-    uses = inside()
+    uses = sorted([_running[use_id] for use_id in _entered.get() & _running.keys()])
     if wait_timeout_s is not None or not uses:
         yield wait_timeout_s
         return
@@ -56,5 +51,5 @@ def bounded(consumer: str, wait_timeout_s: float | None) -> Iterator[float | Non
         raise WouldDeadlock(
             f"{consumer} waited {WAIT_IN_USE_S:g} s inside {told}, which may keep its room",
             hint="end the use first, acquire beside it, or say `wait_timeout_s`",
-            details={"uses": list(uses), "waited": ended.details},
+            details={"uses": uses, "waited": ended.details},
         ) from ended

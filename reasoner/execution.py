@@ -19,7 +19,7 @@ from vram_arbiter.reasoner.outcomes import how_it_went, of_result
 from vram_arbiter.reasoner.palette import Palette
 from vram_arbiter.reasoner.planner import Outcome
 from vram_arbiter.schemas.errors import BadRequest, BadState, RunnerUnreachable, VramError
-from vram_arbiter.schemas.goals import ResultPush
+from vram_arbiter.schemas.goals import CancelGoal, GetResult, ResultPush
 from vram_arbiter.schemas.tools import ExecuteRskill
 
 log = logging.getLogger(__name__)
@@ -102,10 +102,10 @@ class Execution:
         """Cancel a goal that may have been accepted, and wait for its end."""
         ask = self.runner.ask_about
         with contextlib.suppress(BadRequest):  # it never was accepted
-            await ask(goal_id, "cancel")
+            await ask(CancelGoal(goal_id=goal_id))
             while True:
                 try:
-                    await ask(goal_id, "result")
+                    await ask(GetResult(goal_id=goal_id))
                 except BadState:  # it runs
                     await asyncio.sleep(ASK_AGAIN_S)
                 else:

@@ -12,6 +12,7 @@ import logging
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.reasoner.inbox import Danger, Inbox
 from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.goals import GetState
 from vram_arbiter.schemas.plain import Message
 
 log = logging.getLogger(__name__)
@@ -49,7 +50,7 @@ async def _danger(
     told: set[str] = set()  # stale components that the planner has heard of
     while True:
         try:
-            state = await runner.call("state", timeout_s=answer_s)
+            state = await runner.call(GetState(), timeout_s=answer_s)
         except VramError as error:
             lost += 1
             log.warning("%s", error)

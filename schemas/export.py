@@ -75,7 +75,9 @@ def public_models(module: ModuleType) -> list[type]:
         and (
             issubclass(value, BaseModel)
             or is_typeddict(value)
-            or (is_dataclass(value) and ".wire." in module.__name__)
+            or (
+                is_dataclass(value) and (".wire." in module.__name__ or ".goals" in module.__name__)
+            )
         )
     ]
 

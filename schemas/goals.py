@@ -6,103 +6,127 @@ Request {"op": …, "id": n, …} → reply {"re": n, "ok": true, …} | {"re": 
 `schemas.estop`.
 """
 
-from typing import Annotated, Literal, NotRequired, TypedDict
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar, Literal, NotRequired, TypedDict
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, TypeAdapter
-
-from vram_arbiter.schemas.limits import Name, Seconds
-from vram_arbiter.schemas.plain import Message
+from vram_arbiter.schemas.limits import STRICT, Limits, Name, Seconds
+from vram_arbiter.schemas.plain import JsonMap, JsonObject, Message
 from vram_arbiter.schemas.runtime.telemetry.traceparent import Traceparent
 
 
-class _Call(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-    id: Annotated[int, Field(ge=0, lt=1 << 53)]
+class _Json:
+    """An object of what JSON can say."""
+
+    def __get_pydantic_core_schema__(self, source: object, handler: Any) -> JsonObject:
+        from pydantic import JsonValue
+
+        schema: JsonObject = handler.generate_schema(dict[str, JsonValue])
+        return schema
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunnerCall:
+    """Base of all requests. `id` is given by the connection, and repeated as `re`; `traceparent` is
+    that of the caller's span."""
+
+    __pydantic_config__: ClassVar = STRICT
+    id: Annotated[int, Limits(ge=0, lt=1 << 53)] = 0
     traceparent: Traceparent = None
 
 
-class SendGoal(_Call):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SendGoal(RunnerCall):
     """Execute a skill. One goal at a time; a second is refused with `goal_rejected`. `deadline_s` 0
     takes the manifest's."""
 
-    op: Literal["goal"]
+    op: Literal["goal"] = "goal"
     goal_id: Name
     rskill_id: Name
-    session: Annotated[str, Field(max_length=64)] = ""
+    session: Annotated[str, Limits(max_length=64)] = ""
     """Of the runner that the task began with (`skills`, `state`): another one refuses the goal with
     `goal_rejected`. "": any runner executes it."""
     revision: str = ""
-    prompt: Annotated[str, Field(max_length=2000)] = ""
-    goal_params: dict[str, JsonValue] = Field(default_factory=dict)
+    prompt: Annotated[str, Limits(max_length=2000)] = ""
+    goal_params: Annotated[JsonMap, _Json()] = field(default_factory=dict)
     deadline_s: Seconds = 0.0
-    max_ticks: Annotated[int, Field(gt=0)] | None = (
+    max_ticks: Annotated[int, Limits(gt=0)] | None = (
         None  # of motion; then it has failed with `limit_exceeded`
     )
 
 
-class CancelGoal(_Call):
-    op: Literal["cancel"]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CancelGoal(RunnerCall):
+    op: Literal["cancel"] = "cancel"
     goal_id: Name
 
 
-class GetResult(_Call):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GetResult(RunnerCall):
     """The result of a goal that ended (the last 64 are kept): for a client that reconnected."""
 
-    op: Literal["result"]
+    op: Literal["result"] = "result"
     goal_id: Name
 
 
-class GetFrame(_Call):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GetFrame(RunnerCall):
     """Latest frame of a camera, no older than `max_age_ms`, else `frame_stale`. "" takes the
     runner's first camera."""
 
-    op: Literal["frame"]
+    op: Literal["frame"] = "frame"
     camera: str = ""
     encoding: Literal["jpeg", "png"] = (
         "jpeg"  # models want png: jpeg's artefacts cost them accuracy
     )
-    max_age_ms: Annotated[float, Field(gt=0, le=60_000)] = 500.0
+    max_age_ms: Annotated[float, Limits(gt=0, le=60_000)] = 500.0
 
 
-class GetState(_Call):
-    op: Literal["state"]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GetState(RunnerCall):
+    op: Literal["state"] = "state"
 
 
-class GetSkills(_Call):
-    op: Literal["skills"]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GetSkills(RunnerCall):
+    op: Literal["skills"] = "skills"
 
 
-class GetGroundTruth(_Call):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GetGroundTruth(RunnerCall):
     """Simulator only: what is really there. For judges, never for planners."""
 
-    op: Literal["ground_truth"]
+    op: Literal["ground_truth"] = "ground_truth"
 
 
-class ResetWorld(_Call):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResetWorld(RunnerCall):
     """Simulator only: begin the scene again, or that of another seed. Refused while a goal runs."""
 
-    op: Literal["reset"]
-    seed: Annotated[int, Field(ge=0, lt=1 << 31)] | None = None
+    op: Literal["reset"] = "reset"
+    seed: Annotated[int, Limits(ge=0, lt=1 << 31)] | None = None
 
 
-class MarkEpisode(_Call):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MarkEpisode(RunnerCall):
     """The operator's verdict on the episode of a goal: the one that runs, or the last one. ""
     takes that goal. A discarded episode is removed from the dataset."""
 
-    op: Literal["mark"]
+    op: Literal["mark"] = "mark"
     verdict: Literal["success", "failure", "discard"]
     goal_id: Name | Literal[""] = ""
 
 
-class PingRunner(_Call):
-    op: Literal["ping"]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PingRunner(RunnerCall):
+    op: Literal["ping"] = "ping"
 
 
-class ShutdownRunner(_Call):
-    op: Literal["shutdown"]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShutdownRunner(RunnerCall):
+    op: Literal["shutdown"] = "shutdown"
 
 
-RunnerRequest = Annotated[
+RunnerRequest = (
     SendGoal
     | CancelGoal
     | GetResult
@@ -113,10 +137,8 @@ RunnerRequest = Annotated[
     | ResetWorld
     | MarkEpisode
     | PingRunner
-    | ShutdownRunner,
-    Field(discriminator="op"),
-]
-RUNNER_REQUEST: TypeAdapter[RunnerRequest] = TypeAdapter(RunnerRequest)
+    | ShutdownRunner
+)
 
 
 class FrameReply(TypedDict):
@@ -147,4 +169,4 @@ class ResultPush(TypedDict):
     success: bool
     code: str  # "" or a code of schemas.errors
     message: str
-    data: dict[str, JsonValue]
+    data: JsonObject

@@ -53,7 +53,7 @@ class ClientProtocol:
     def next_deadline(self) -> float | None:
         """Return when `tick` is due at the latest."""
         ends = chain(
-            self.connection.deadlines(self._expects_grants()),
+            self.connection.deadlines(bool(self.waits.waiters or self.holdings.asleep)),
             self.waits.deadlines(),
             self.holdings.deadlines(),
         )
@@ -68,10 +68,7 @@ class ClientProtocol:
         self.holdings.end_overdue(now)
         if self.connection.stays_up(now):  # 3
             self.holdings.renew(now)  # 4
-            self.connection.ping_if_silent(now, self._expects_grants())
-
-    def _expects_grants(self) -> bool:
-        return bool(self.waits.waiters or self.holdings.asleep)
+            self.connection.ping_if_silent(now, bool(self.waits.waiters or self.holdings.asleep))
 
     # -- for the connection (`clients._protocol.connection.Above`) ---------------------------------
     def reattachments(self) -> tuple[w.ReattachLease, ...]:

@@ -28,7 +28,7 @@ class Reading:
 @dataclass(frozen=True, slots=True)
 class Gpu:
     """One GPU. `device` is its name for sidecars, `environ` limits a program to it; `read` raises
-    ProbeFailed."""
+    ProbeFailed or NoGpu."""
 
     uuid: str
     name: str
@@ -61,77 +61,47 @@ def fake_gpu(folder: Path) -> Gpu:
     Bytes of a living process that are on their way back are still counted for it: no other process
     can have them, and a simulated peak lasts no longer than they do.
     """
-    try:
-        config = fakegpu.parse_config((folder / fakegpu.GPU_FILE).read_text())
-    except (OSError, UnicodeDecodeError) as error:
-        hint = "start the arbiter with --gpu fake:8GiB"
-        raise NoGpu(f"no simulated GPU in {folder}: {error}", hint=hint) from error
 
-    def read() -> Reading:
+    def state() -> fakegpu.GpuState:
         try:
             with locked(folder):
-                gpu = settled(folder)
+                return settled(folder)
         except (ConfigError, OSError, UnicodeDecodeError) as error:
-            raise ProbeFailed(
-                f"the simulated GPU in {folder} cannot be read: {error}",
-                hint="stop what uses it and delete the folder; the arbiter creates it again",
+            raise NoGpu(
+                f"no simulated GPU can be read in {folder}: {error}",
+                hint="start the arbiter with --gpu fake:8GiB; it creates the folder again",
             ) from error
+
+    def read() -> Reading:
+        gpu = state()
         if gpu.config.faults.hide_processes:
             return Reading(gpu.used_bytes, None)
         living = [one for one in gpu.processes.values() if one.died_at_s is None]
         return Reading(gpu.used_bytes, {one.pid: one.on_gpu_bytes for one in living})
 
-    environ = {fakegpu.FOLDER_VARIABLE: str(folder)}
+    config, environ = state().config, {fakegpu.FOLDER_VARIABLE: str(folder)}
     return Gpu(config.uuid, config.name, "simulated", f"fake:{folder}", environ, read)
 
 
 def nvml_gpu(index: int, nvml: Any) -> Gpu:
     """Open the NVIDIA GPU number `index`, in the order of NVML and of the PCI bus. `nvml` is the
-    module `pynvml`. Raises NoGpu, ConfigError for MIG."""
-    try:
-        nvml.nvmlInit()
-        count = nvml.nvmlDeviceGetCount()
-        if index >= count:
-            raise NoGpu(f"the NVIDIA driver knows {count} GPUs, not number {index}", hint=_HINT)
-        handle = nvml.nvmlDeviceGetHandleByIndex(index)
-        uuid, name, driver = (
-            value.decode(errors="replace") if isinstance(value, bytes) else value
-            for value in (
-                nvml.nvmlDeviceGetUUID(handle),
-                nvml.nvmlDeviceGetName(handle),
-                nvml.nvmlSystemGetDriverVersion(),
-            )
-        )
-        nvml.nvmlDeviceGetMemoryInfo(handle)
-    except nvml.NVMLError_NotSupported as error:
-        raise NoGpu(
-            f"GPU {index} has no memory of its own, so its bytes cannot be told apart",
-            hint="write its footprint by hand",
-        ) from error
-    except nvml.NVMLError as error:
-        raise NoGpu(f"no NVIDIA driver answers: {error}", hint=_HINT) from error
-    if _is_split(nvml, handle):
-        raise ConfigError(
-            f"{uuid} is in MIG mode: its instances have memory of their own",
-            hint=f"nvidia-smi -i {index} -mig 0",
-        )
+    module `pynvml`. Raises NoGpu."""
 
     def read() -> Reading:
         try:
-            return Reading(_used(nvml, handle), _listed(nvml, handle))
+            return Reading(nvml.nvmlDeviceGetMemoryInfo(handle).used, _listed(nvml, handle))
         except nvml.NVMLError as error:
-            problem = f"memory of {uuid} cannot be read: {error}"
+            problem = f"memory of GPU {index} cannot be read: {error}"
             raise ProbeFailed(problem, hint="see nvidia-smi and dmesg") from error
 
-    return Gpu(uuid, name, driver, "cuda", {cuda.VISIBLE: uuid, cuda.ORDER: cuda.PCI}, read)
-
-
-def _used(nvml: Any, handle: Any) -> int:
-    """Version 2 leaves out what the driver reserves for itself."""
     try:
-        return int(nvml.nvmlDeviceGetMemoryInfo(handle, version=nvml.nvmlMemory_v2).used)
-    except (nvml.NVMLError_NotSupported, nvml.NVMLError_FunctionNotFound):
-        return int(nvml.nvmlDeviceGetMemoryInfo(handle).used)
+        nvml.nvmlInit()
+        handle = nvml.nvmlDeviceGetHandleByIndex(index)
+        uuid, name = nvml.nvmlDeviceGetUUID(handle), nvml.nvmlDeviceGetName(handle)
+        driver = nvml.nvmlSystemGetDriverVersion()
+    except nvml.NVMLError as error:
+        raise NoGpu(f"no NVIDIA driver answers for GPU {index}: {error}", hint=_HINT) from error
+    return Gpu(uuid, name, driver, "cuda", {cuda.VISIBLE: uuid, cuda.ORDER: cuda.PCI}, read)
 
 
 def _listed(nvml: Any, handle: Any) -> dict[int, int] | None:
@@ -142,14 +112,8 @@ def _listed(nvml: Any, handle: Any) -> dict[int, int] | None:
         except nvml.NVMLError:
             return None
         for process in found:
-            if process.usedGpuMemory is not None:  # WSL2 and some containers list pids alone
-                known = processes.get(process.pid, 0)  # a process in both lists counts once
-                processes[process.pid] = max(known, int(process.usedGpuMemory))
+            if process.usedGpuMemory is None:
+                return None  # WSL2 and some containers list pids alone
+            known = processes.get(process.pid, 0)  # a process in both lists counts once
+            processes[process.pid] = max(known, int(process.usedGpuMemory))
     return processes
-
-
-def _is_split(nvml: Any, handle: Any) -> bool:
-    try:
-        return bool(nvml.nvmlDeviceGetMigMode(handle)[0])
-    except nvml.NVMLError:
-        return False  # most GPUs have no such mode

@@ -6,41 +6,31 @@ monotonic time at which a phase ended, to the file that the plan names, and rest
 """
 
 import asyncio
+import io
 import json
-import random
-import struct
 import sys
 import tempfile
 import time
-import zlib
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient, RewardClient, SceneVlmClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
-from vram_arbiter.schemas.errors import ConfigError, SidecarUnavailable, VramError
+from vram_arbiter.schemas.errors import SidecarUnavailable, VramError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
 from vram_arbiter.schemas.manifest.vocabulary import Modality
 from vram_arbiter.schemas.plain import Message
-from vram_arbiter.schemas.runtime.extras import need
 
 LOAD_S = 1800.0
 """A large model from a cold disk."""
-SIDE, POLICY_SIDE = 1024, 480
+SIDE, POLICY_SIDE, REWARD_PICTURES = 1024, 480, 8
 """Pixels of a picture's sides: the longest side that detector and scene VLM look at by default, and
-that of a policy's camera where the manifest does not say."""
-REWARD_PICTURES = 8
-CLIENTS: dict[Kind, type[SidecarClient]] = {
-    Kind.DETECTOR: DetectorClient,
-    Kind.VLM: SceneVlmClient,
-    Kind.REWARD: RewardClient,
-    Kind.VLA: PolicyClient,
-}
+that of a policy's camera where the manifest does not say; pictures of one question for a reward."""
 
-type Ask = Callable[[], Coroutine[Any, Any, object]]
+type Ask = Callable[[Any, RSkillManifest], Coroutine[Any, Any, object]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,19 +40,9 @@ class Plan:
     rskill: str
     sidecar: Sequence[str]  # its command
     requests: int
-    rest_s: float
     marks: str
-
-
-def check(manifest: RSkillManifest) -> None:
-    """Raises ConfigError for a model that cannot be asked."""
-    if manifest.kind not in CLIENTS:
-        raise ConfigError(
-            f"{manifest.name} is of kind {manifest.kind.value}, which no sidecar serves",
-            hint="give the manifest of a detector, vlm, reward or vla skill",
-        )
-    if manifest.kind is Kind.VLA:
-        need(f"a request to {manifest.name}", "numpy", extra="sidecars")
+    rest_s: float = 2.0
+    """Longer than drivers take to return memory (0.5 to 1.5 s)."""
 
 
 async def run(plan: Plan) -> dict[str, float]:
@@ -86,14 +66,13 @@ async def run(plan: Plan) -> dict[str, float]:
 
 async def _work(plan: Plan, endpoint: str) -> dict[str, float]:
     manifest, marks = load_manifest(Path(plan.rskill)), {"requests": float(plan.requests)}
-    kind = CLIENTS[manifest.kind]
+    kind, ask = ASKED[manifest.kind]
     async with kind(endpoint, timeout_s=LOAD_S, connect_timeout_s=LOAD_S) as client:
-        ask = asking(client, manifest)
         await client.load()
         await asyncio.sleep(plan.rest_s)
         marks["asked"] = time.monotonic()
         for _ in range(plan.requests):
-            await ask()
+            await ask(client, manifest)
         await asyncio.sleep(0.1)  # a reading after the last answer
         marks["answered"] = time.monotonic()
         await client.unload()
@@ -102,32 +81,18 @@ async def _work(plan: Plan, endpoint: str) -> dict[str, float]:
     return marks
 
 
-def asking(client: SidecarClient, manifest: RSkillManifest) -> Ask:
-    """Return what makes one request at each call, with noise and the manifest's words."""
-    task = manifest.default_prompt or manifest.description
-    if isinstance(client, PolicyClient):
-        observation, policy = observation_of(manifest, task), client
-        return lambda: policy.get_action(observation)
-    shown = noise_png()
-    match client:
-        case DetectorClient() as detector:
-            labels = manifest.detector.labels if manifest.detector else ()
-            return lambda: detector.detect(shown, ", ".join(labels) or "object")
-        case RewardClient() as reward:
-            return lambda: reward.score([shown] * REWARD_PICTURES, task)
-        case SceneVlmClient() as vlm:
-            return lambda: vlm.query(shown, "Describe everything in the picture.")
-    raise AssertionError(f"no request is known for {type(client).__name__}")
+def task_of(manifest: RSkillManifest) -> str:
+    return manifest.default_prompt or manifest.description
 
 
-def observation_of(manifest: RSkillManifest, task: str) -> Message:
+def observation_of(manifest: RSkillManifest) -> Message:
     """Return an observation as the manifest describes it: noise for the cameras, the starting pose
     or zeros for the joints."""
     import numpy as np
 
     rng = np.random.default_rng(0)
     width = (manifest.state_contract and manifest.state_contract.dim) or 0
-    observation: Message = {"task": task}
+    observation: Message = {"task": task_of(manifest)}
     if pose := manifest.starting_pose or (0.0,) * width:
         observation["observation.state"] = np.array(pose, dtype=np.float32)
     for sensor in manifest.sensors_required:
@@ -139,17 +104,28 @@ def observation_of(manifest: RSkillManifest, task: str) -> Message:
 
 def noise_png(side: int = SIDE) -> bytes:
     """Return a picture of gray noise. Noise has no large flat areas, so no model can skip it."""
-    pixels = random.Random(0).randbytes(side * side)
-    rows = b"".join(b"\0" + pixels[at : at + side] for at in range(0, len(pixels), side))
-    parts = (
-        (b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)),
-        (b"IDAT", zlib.compress(rows, 1)),
-        (b"IEND", b""),
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in parts
-    )
+    from PIL import Image
+
+    picture = io.BytesIO()
+    Image.effect_noise((side, side), 100.0).save(picture, "PNG")
+    return picture.getvalue()
+
+
+ASKED: Final[dict[Kind, tuple[type[SidecarClient], Ask]]] = {
+    Kind.DETECTOR: (
+        DetectorClient,
+        lambda client, manifest: client.detect(
+            noise_png(), ", ".join(manifest.detector.labels if manifest.detector else ()) or "cup"
+        ),
+    ),
+    Kind.VLM: (SceneVlmClient, lambda client, manifest: client.query(noise_png(), "Describe it.")),
+    Kind.REWARD: (
+        RewardClient,
+        lambda client, manifest: client.score([noise_png()] * REWARD_PICTURES, task_of(manifest)),
+    ),
+    Kind.VLA: (PolicyClient, lambda client, manifest: client.get_action(observation_of(manifest))),
+}
+"""The client of a kind's sidecar, and one request with noise and the manifest's words."""
 
 
 def main() -> int:

@@ -27,7 +27,6 @@ from vram_arbiter.clients.cli.demo_report import (
     MemoryStory,
     draw_timeline,
     read_log,
-    read_samples,
     summarise,
 )
 from vram_arbiter.clients.client import AsyncClient
@@ -38,7 +37,7 @@ from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import RunnerUnreachable, SidecarUnavailable
-from vram_arbiter.schemas.plain import JsonMap, JsonObject
+from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE, RUNTIME_VARIABLE
 from vram_arbiter.schemas.runtime.extras import need
@@ -62,6 +61,17 @@ LOOP_S = (
 POLL_S = 0.2
 
 
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """What is run: `gpu` is `nvml` or `fake:SIZE`; `http`: where a status page is served."""
+
+    seed: int
+    arbiter: bool
+    gpu: str
+    out: Path
+    http: HttpAddress | None = None
+
+
 @dataclass(slots=True)
 class Watch:
     """What was seen while the loop ran."""
@@ -69,7 +79,7 @@ class Watch:
     start_s: float
     wall_offset_s: float  # wall clock minus monotonic clock
     events: list[JsonObject] = field(default_factory=list)
-    samples: list[tuple[float, JsonMap]] = field(default_factory=list)
+    measured: list[tuple[float, int]] = field(default_factory=list)
     capacity_bytes: int = 0
 
 
@@ -146,24 +156,22 @@ def run(args: argparse.Namespace) -> int:
     packages = ("torch", "lerobot", "transformers", "mujoco", "cv2", "matplotlib")
     need("the demo", *packages, extra="all")
     out: Path = args.out
-    summary = asyncio.run(_demo(args.seed, arbiter, args.gpu, args.http, out))
+    summary = asyncio.run(_demo(Episode(args.seed, arbiter, args.gpu, out, args.http)))
     print(json.dumps({key: value for key, value in summary.items() if key != "loads"}, indent=2))
     print(f"written: {out}/summary.json, {out}/timeline.png, {out}/episode.mp4")
     oom = summary["oom_events"] > 0
     return 0 if (summary["completed"] and not oom if arbiter else oom) else 1
 
 
-async def _demo(
-    seed: int, arbiter: bool, gpu: str, http: HttpAddress | None, out: Path
-) -> JsonObject:
-    shutil.rmtree(out, ignore_errors=True)
-    (out / "logs").mkdir(parents=True)
+async def _demo(what: Episode) -> JsonObject:
+    shutil.rmtree(what.out, ignore_errors=True)
+    (what.out / "logs").mkdir(parents=True)
     runtime = Path(
         tempfile.mkdtemp(prefix="vram-demo-")
     )  # short: ipc paths have at most 107 characters
     try:
         programs = Programs(
-            out / "logs",
+            what.out / "logs",
             {
                 RUNTIME_VARIABLE: str(runtime),
                 ENDPOINT_VARIABLE: f"ipc://{runtime}/arbiter.sock",  # not the machine's own
@@ -172,42 +180,22 @@ async def _demo(
             },
         )
         try:
-            return await _episode(
-                programs, runtime, seed=seed, arbiter=arbiter, gpu=gpu, http=http, out=out
-            )
+            return await _episode(programs, runtime, what)
         finally:
             await programs.stop_all()
     finally:
         shutil.rmtree(runtime, ignore_errors=True)
 
 
-async def _episode(
-    programs: Programs,
-    runtime: Path,
-    *,
-    seed: int,
-    arbiter: bool,
-    gpu: str,
-    http: HttpAddress | None,
-    out: Path,
-) -> JsonObject:
+async def _episode(programs: Programs, runtime: Path, what: Episode) -> JsonObject:
+    gpu, out, arbiter = what.gpu, what.out, what.arbiter
     folder = runtime / "fakegpu"
     if gpu.startswith("fake:"):
         make_gpu(folder, parse_bytes(gpu.removeprefix("fake:")))
     watch = Watch(time.monotonic(), time.time() - time.monotonic())
     async with contextlib.AsyncExitStack() as stack:
         runner = await stack.enter_async_context(RunnerClient(f"ipc://{runtime}/runner.sock"))
-        client = await boot(
-            programs,
-            runtime,
-            runner,
-            stack,
-            seed=seed,
-            arbiter=arbiter,
-            gpu=gpu,
-            http=http,
-            out=out,
-        )
+        client = await boot(programs, runtime, runner, stack, what)
         target = (await runner.ground_truth())["target"]
         task = f"grab the {target}"
         watch.start_s = time.monotonic()
@@ -229,7 +217,7 @@ async def _episode(
     )
     capacity = watch.capacity_bytes or parse_bytes(gpu.removeprefix("fake:"))
     summary = summarise(
-        seed=seed, arbiter=arbiter, task=task, story=story, capacity_bytes=capacity,
+        seed=what.seed, arbiter=arbiter, task=task, story=story, capacity_bytes=capacity,
         events=watch.events, reasoner=outcome, truth=truth,
         target=target, seconds=seconds,
     )  # fmt: skip
@@ -239,7 +227,8 @@ async def _episode(
         f"{summary['oom_events']} out-of-memory"
     )
     draw_timeline(
-        out / "timeline.png", story, capacity, watch.events, start_s=watch.start_s,
+        out / "timeline.png", story, capacity, watch.events,
+        watch.measured if gpu == "nvml" else (), start_s=watch.start_s,
         wall_offset_s=watch.wall_offset_s,
         title=title + ("" if arbiter else " (no arbiter)"),
     )  # fmt: skip
@@ -264,15 +253,11 @@ async def boot(
     runtime: Path,
     runner: RunnerClient,
     stack: contextlib.AsyncExitStack,
-    *,
-    seed: int,
-    arbiter: bool,
-    gpu: str,
-    out: Path,
-    http: HttpAddress | None = None,
+    what: Episode,
 ) -> AsyncClient | None:
     """Start everything and wait until each answers. The arbiter's client, if there is an
     arbiter."""
+    gpu, arbiter = what.gpu, what.arbiter
     print(
         f"starting {'the arbiter, ' if arbiter else ''}three sidecars and the runner (imports take "
         "a while) …"
@@ -284,21 +269,23 @@ async def boot(
         config = runtime / "arbiter.yaml"
         # a larger real GPU is budgeted like the small one
         config.write_text(f'gpu:\n  capacity_bytes: {{"0": {BUDGET}}}\n')
-        page = [] if http is None else ["--http", str(http)]
+        page = [] if what.http is None else ["--http", str(what.http)]
         await programs.start("arbiter", "arbiter", "--gpu", source, "--config", str(config), *page)
         client = await stack.enter_async_context(_arbiter_client(runtime))
         top = f"{_vramctl()} top --endpoint ipc://{runtime}/arbiter.sock"
         print(f"live in another terminal: {top}")
-        if http is not None:
-            print(f"status page: http://{http}")
+        if what.http is not None:
+            print(f"status page: http://{what.http}")
     device = "cuda" if gpu == "nvml" else f"fake:{runtime}/fakegpu"
     for name, rskill in SIDECARS.items():
         manifest = str(configs_folder(os.environ) / "rskills" / rskill / "rskill.yaml")
         await programs.start(
             name, "sidecars", "--name", name, "--rskill", manifest, "--device", device, *without
         )
-    video = str((out / "episode.mp4").resolve())
-    await programs.start("runner", "runner", "sim", "--seed", str(seed), "--video", video, *without)
+    video = str((what.out / "episode.mp4").resolve())
+    await programs.start(
+        "runner", "runner", "sim", "--seed", str(what.seed), "--video", video, *without
+    )
     endpoints = {name: f"ipc://{runtime}/{name}.sock" for name in SIDECARS}
     sidecars = [
         DetectorClient(endpoints["detector"]),
@@ -366,8 +353,9 @@ async def _look(client: AsyncClient | None, display: Display, watch: Watch) -> N
     if client is None:
         return
     status = to_map(await client.status())
-    watch.samples += [(time.monotonic(), gpu) for gpu in status["gpus"]]
-    watch.capacity_bytes = status["gpus"][0]["capacity_bytes"]
+    gpu = status["gpus"][0]
+    watch.measured.append((time.monotonic(), gpu["measured_used_bytes"] or 0))
+    watch.capacity_bytes = gpu["capacity_bytes"]
     after = watch.events[-1]["seq"] if watch.events else 0
     for event in (await client.history(after=after)).events:
         watch.events.append(dict(event))
@@ -386,5 +374,7 @@ def _last_line(program: Program) -> str:
 
 def _story(folder: Path, gpu: str, names: Mapping[int, str], watch: Watch) -> MemoryStory:
     if gpu == "nvml":
-        return read_samples(watch.samples, names, watch.events, watch.wall_offset_s)
+        refused = (event["at_wall_s"] for event in watch.events if event["kind"] == "oom")
+        peak_bytes = max((used for _, used in watch.measured), default=0)
+        return MemoryStory((), peak_bytes, tuple(at_s - watch.wall_offset_s for at_s in refused))
     return read_log((folder / fakegpu.LOG_FILE).read_text(), names)

@@ -5,7 +5,7 @@ Pure but for writing those two files. It must not know how the programs were sta
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,30 +56,6 @@ def read_log(text: str, names: Mapping[int, str]) -> MemoryStory:
     return MemoryStory(tuple(points), peak, tuple(refused))
 
 
-def read_samples(
-    samples: Sequence[tuple[float, JsonMap]],
-    names: Mapping[int, str],
-    events: Iterable[JsonMap],
-    wall_offset_s: float,
-) -> MemoryStory:
-    """The same for a real GPU, from `status` readings of the arbiter: (monotonic seconds,
-    GpuView)."""
-    points: list[Point] = []
-    peak = 0
-    for at_s, gpu in samples:
-        peak = max(peak, gpu["measured_used_bytes"] or 0)
-        points += [
-            Point(
-                at_s, names.get(process["pid"], f"pid {process['pid']}"), process["used_bytes"] or 0
-            )
-            for process in gpu["processes"]
-        ]
-    refused = tuple(
-        event["at_wall_s"] - wall_offset_s for event in events if event["kind"] == "oom"
-    )
-    return MemoryStory(tuple(points), peak, refused)
-
-
 def summarise(
     *, seed: int, arbiter: bool, task: str, story: MemoryStory, capacity_bytes: int,
     events: Sequence[JsonMap],
@@ -126,6 +102,7 @@ def draw_timeline(
     story: MemoryStory,
     capacity_bytes: int,
     events: Sequence[JsonMap],
+    measured: Sequence[tuple[float, int]] = (),
     *,
     start_s: float,
     wall_offset_s: float,
@@ -136,11 +113,11 @@ def draw_timeline(
     begin_s = start_s + wall_offset_s
     gpu = next((str(event["gpu"]) for event in events if event.get("gpu")), "GPU")
     reader = Reader(begin_s)
-    held = reader.gpu(gpu, "GPU", capacity_bytes).held
-    ends = [begin_s + 1.0]
+    drawn, ends = reader.gpu(gpu, "GPU", capacity_bytes), [begin_s + 1.0]
+    drawn.measured += [(at_s + wall_offset_s, used) for at_s, used in measured]
     for point in sorted(story.points, key=lambda point: point.at_s):
         at_s = point.at_s + wall_offset_s
-        held.setdefault(point.name, []).append((at_s, point.held_bytes))
+        drawn.held.setdefault(point.name, []).append((at_s, point.held_bytes))
         ends.append(at_s)
     for event in events:
         if event["kind"] != "oom":  # the GPU's log has them all

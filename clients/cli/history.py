@@ -79,14 +79,6 @@ def run(args: argparse.Namespace) -> int:
     return history(wanted, as_json=args.as_json, endpoint=args.endpoint)
 
 
-def since(written: str) -> float:
-    """Argparse type of `--since`: `parse_since` from this moment."""
-    try:
-        return parse_since(written, time.time())
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
 def kind(written: str) -> str:
     """Argparse type: a kind of event. A mistyped one would look like a history without such."""
     from vram_arbiter.schemas.wire.notes import DAEMON_KINDS, NOTES
@@ -103,23 +95,22 @@ AGO = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|d)")
 UNITS = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 
 
-def parse_since(written: str, now_wall_s: float) -> float:
-    """`90s`, `10m`, `2h`, `1d` ago; `14:30` or `14:30:05`, the last time it was so late; or a date,
-    `2026-11-21 14:30`. Wall seconds.
-
-    Raises ValueError that says what may be written.
-    """
+def since(written: str, now_wall_s: float | None = None) -> float:
+    """Argparse type of `--since`: `90s`, `10m`, `2h`, `1d` ago; `14:30` or `14:30:05`, the last
+    time it was so late; or a date, `2026-11-21 14:30`. Wall seconds."""
+    now = time.time() if now_wall_s is None else now_wall_s
     if ago := AGO.fullmatch(written.strip()):
-        return now_wall_s - float(ago[1]) * UNITS[ago[2]]
+        return now - float(ago[1]) * UNITS[ago[2]]
     if ":" in written and "-" not in written:  # a bare number is no time of day
         with contextlib.suppress(ValueError):
             clock = datetime.time.fromisoformat(written.strip())
-            today = datetime.datetime.fromtimestamp(now_wall_s)
+            today = datetime.datetime.fromtimestamp(now)
             at = datetime.datetime.combine(today.date(), clock).timestamp()
-            return at if at <= now_wall_s else at - UNITS["d"]
+            return at if at <= now else at - UNITS["d"]
     with contextlib.suppress(ValueError):
         return datetime.datetime.fromisoformat(written.strip()).timestamp()
-    raise ValueError(f"expected 90s, 10m, 2h, 1d, 14:30 or '2026-11-21 14:30', got {written!r}")
+    expected = "90s, 10m, 2h, 1d, 14:30 or '2026-11-21 14:30'"
+    raise argparse.ArgumentTypeError(f"expected {expected}, got {written!r}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,6 @@ What happens on an eviction is `clients.foreign`'s; docs/how-to/foreign-programs
 
 import argparse
 import asyncio
-import os
 import shutil
 from collections.abc import Sequence
 from typing import Final
@@ -24,7 +23,7 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.actions import Action
 from vram_arbiter.clients.foreign.cuda_checkpoint import CheckpointAction, CudaDriver
 from vram_arbiter.clients.foreign.http import HttpAction, Request, checked_url
-from vram_arbiter.clients.foreign.program import STDERR, ForeignProgram, adopt_orphans
+from vram_arbiter.clients.foreign.program import adopt_orphans
 from vram_arbiter.clients.foreign.run_spec import OnRevoke, RunSpec, lease_spec
 from vram_arbiter.clients.foreign.say import say
 from vram_arbiter.clients.foreign.servers import SERVERS
@@ -202,7 +201,8 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
     ArbiterUnreachable, CheckpointUnsupported, ConfigError; with a record also CalibrationFailed."""
     program = shutil.which(spec.command[0])
     if program is None:
-        return _not_started(spec)
+        say(f"{spec.command[0]}: not found, or not a file that may be executed")
+        return NOT_FOUND
     if spec.action is not None:
         spec.action.check()
     if spec.comes_back:
@@ -225,32 +225,6 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
     return code if code >= 0 else 128 - code
 
 
-async def run_alone(spec: RunSpec) -> int:
-    """Run a program without a lease, for its record alone. Returns its exit code."""
-    path = shutil.which(spec.command[0])
-    if path is None:
-        return _not_started(spec)
-    assert spec.record is not None, "nothing else is done without a lease"
-    await spec.record.begin()
-    environ = {**os.environ, **spec.environ}
-    try:
-        program = await ForeignProgram.start(path, spec.command[1:], environ, STDERR)
-    except OSError as error:
-        say(f"{path}: {error.strerror}")
-        return NOT_STARTED
-    with Forwarding(lambda number: None) as signals:
-        signals.to(program)
-        try:
-            async with asyncio.timeout(spec.limit_s):
-                code = await program.wait()
-        except TimeoutError:
-            await program.end(spec.grace_s)
-            code = 0
-        await program.end_orphans()
-    await spec.record.end()
-    return code if code >= 0 else 128 - code
-
-
 def check_gpus(wanted: str, gpus: Sequence[GpuView]) -> None:
     """Raises ConfigError where a program that lives on could be granted another GPU later."""
     if wanted == "any" and len(gpus) > 1:
@@ -258,19 +232,3 @@ def check_gpus(wanted: str, gpus: Sequence[GpuView]) -> None:
             f"there are {len(gpus)} GPUs, and the program must return to the one it was started on",
             hint="name one with --gpu",
         )
-
-
-def _not_started(spec: RunSpec) -> int:
-    """Say why a command is not an executable file. Returns the exit code."""
-    command = spec.command[0]
-    folders = [""] if os.sep in command else os.environ.get("PATH", os.defpath).split(os.pathsep)
-    found = [
-        path
-        for folder in folders
-        if command and os.path.exists(path := os.path.join(folder, command))
-    ]
-    if not found:
-        say(f"{command}: not found")
-        return NOT_FOUND
-    say(f"{command}: {'is a directory' if os.path.isdir(found[0]) else 'permission denied'}")
-    return NOT_STARTED

@@ -79,7 +79,7 @@ class Supervisor:
         self._signals = signals
         try:
             if self._spec.record is not None:
-                await self._spec.record.begin()
+                self._spec.record.begin()
             await self._start()
         except (OSError, VramError):
             await self.lease.release()
@@ -103,7 +103,7 @@ class Supervisor:
         try:
             if self._spec.record is not None:
                 self._check_undisturbed()
-                await self._spec.record.end()
+                self._spec.record.end()
         finally:
             say(self.peak.text())
             await self.lease.release(exiting=True)

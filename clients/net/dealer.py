@@ -86,7 +86,7 @@ class Dealer:
             self._unsent.append(payload)
             return True
         sent = self._link.send(payload)
-        if self._reading is not None and self._link.readable:
+        if self._reading is not None and int(self._link.socket.get(zmq.EVENTS)) & zmq.POLLIN:
             self._reading.cancel()  # sending took the reader's wake-up
         return sent
 

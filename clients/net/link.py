@@ -105,11 +105,6 @@ class Link:
             return False
         return True
 
-    @property
-    def readable(self) -> bool:
-        """Whether `receive` would return a message."""
-        return bool(int(self.socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
-
     def receive(self) -> bytes | None:
         """The last frame of the next message; None: there is none yet. Raises UntrustedServer; the
         link has ended then."""

@@ -13,7 +13,9 @@ import logging
 import os
 import uuid
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Annotated, Any, Final
+
+from pydantic import Discriminator, TypeAdapter
 
 from vram_arbiter.clients.net.server import Peer, RouterServer, parsed, refusal
 from vram_arbiter.runner.control.clock import Clock
@@ -33,7 +35,6 @@ from vram_arbiter.schemas.errors import (
     VramError,
 )
 from vram_arbiter.schemas.goals import (
-    RUNNER_REQUEST,
     CancelGoal,
     GetFrame,
     GetGroundTruth,
@@ -44,6 +45,7 @@ from vram_arbiter.schemas.goals import (
     PingRunner,
     ResetWorld,
     ResultPush,
+    RunnerRequest,
     SendGoal,
     ShutdownRunner,
 )
@@ -55,6 +57,9 @@ READS_MAX = 16  # requests that wait for the control thread; a limit keeps room 
 # of the time, for the goal socket: the control thread waits for the interpreter lock meanwhile
 WORK_SHARE = 0.25
 LOOP_SILENT_S = 1.0  # a control loop that has not looked at the world for so long hangs
+RUNNER_REQUEST: Final[TypeAdapter[RunnerRequest]] = TypeAdapter(
+    Annotated[RunnerRequest, Discriminator("op")]
+)
 OPS = (
     "goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "reset", "mark",
     "ping", "shutdown",

@@ -35,6 +35,7 @@ from vram_arbiter.clients.sidecar.perception import DetectorClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.schemas.errors import RunnerUnreachable, SidecarUnavailable
 from vram_arbiter.schemas.estop import REPLY_MAX_BYTES, Answer, path_of, reply_in, request
+from vram_arbiter.schemas.goals import CancelGoal
 
 SKILLS = {"detector": "so101-detector", "grab": "so101-grab"}
 GRAB = "vram-arbiter/so101-grab"
@@ -308,7 +309,7 @@ async def _drive(
 async def _until_idle(runner: RunnerClient) -> None:
     """Take back the goal that the cancelled task left running."""
     if (goal_id := (await runner.state())["goal"]) is not None:
-        await runner.call("cancel", {"goal_id": goal_id})
+        await runner.call(CancelGoal(goal_id=goal_id))
     async with asyncio.timeout(END_S):
         while (await runner.state())["goal"] is not None:
             await asyncio.sleep(POLL_S)

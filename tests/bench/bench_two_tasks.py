@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TypedDict
 
 from tests.support.paths import ROOT
-from vram_arbiter.clients.cli.demo import BUDGET, LOOP_S, boot, make_gpu
+from vram_arbiter.clients.cli.demo import BUDGET, LOOP_S, Episode, boot, make_gpu
 from vram_arbiter.clients.cli.demo_programs import Programs
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
@@ -55,10 +55,8 @@ async def play_world(seed: int, out: Path) -> list[Task]:
                 runner = await stack.enter_async_context(
                     RunnerClient(f"ipc://{runtime}/runner.sock")
                 )
-                gpu = f"fake:{BUDGET}"
-                await boot(
-                    programs, runtime, runner, stack, seed=seed, arbiter=True, gpu=gpu, out=out
-                )
+                what = Episode(seed, True, f"fake:{BUDGET}", out)
+                await boot(programs, runtime, runner, stack, what)
                 truth = await runner.ground_truth()
                 others = [one for one in truth["objects"] if one != truth["target"]]
                 played: list[Task] = []

@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
+from pydantic import TypeAdapter
 
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
@@ -19,7 +20,7 @@ from vram_arbiter.schemas.errors import (
     UnknownSkill,
     VramError,
 )
-from vram_arbiter.schemas.goals import RUNNER_REQUEST
+from vram_arbiter.schemas.goals import RunnerRequest
 
 pytestmark = pytest.mark.anyio
 
@@ -44,7 +45,7 @@ class FakeRunner:
                 task.cancel()
 
     async def handle(self, peer: Peer, message: dict[str, Any]) -> None:
-        RUNNER_REQUEST.validate_python(message)
+        TypeAdapter(RunnerRequest).validate_python(message)
         self.seen.append(message)
         try:
             reply = {"ok": True, **self.answer(peer, message)}

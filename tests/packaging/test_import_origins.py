@@ -87,7 +87,7 @@ def test_a_project_with_its_own_schemas_and_clients_can_use_ours(tmp_path: Path)
     doctor = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120
     )
-    assert "installation" in doctor.stdout, doctor.stderr
+    assert "units" in doctor.stdout, doctor.stderr
 
 
 @pytest.mark.parametrize("package", PACKAGES)

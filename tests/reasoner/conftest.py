@@ -9,18 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import TypeAdapter
 
 from tests.support.field_server import PNG
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.errors import BadRequest, FrameStale, GoalRejected, VramError
 from vram_arbiter.schemas.goals import (
-    RUNNER_REQUEST,
     CancelGoal,
     GetFrame,
     GetResult,
     GetSkills,
     GetState,
+    RunnerRequest,
     SendGoal,
 )
 from vram_arbiter.schemas.plain import Message
@@ -84,7 +85,7 @@ class Runner:
         await self._server.send(self.peer, push)
 
     async def _handle(self, peer: Peer, message: Message) -> None:
-        request = RUNNER_REQUEST.validate_python(message)
+        request = TypeAdapter[Any](RunnerRequest).validate_python(message)
         number = {"re": request.id}
         try:
             reply = await self._answer(peer, request)

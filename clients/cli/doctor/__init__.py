@@ -3,12 +3,9 @@
 import argparse
 import json
 import os
-import sys
 from collections import Counter
-from pathlib import Path
 from typing import Final
 
-import vram_arbiter
 from vram_arbiter.clients.cli import arguments, terminal
 from vram_arbiter.clients.cli.doctor import (
     access,
@@ -19,27 +16,20 @@ from vram_arbiter.clients.cli.doctor import (
     leftovers,
 )
 from vram_arbiter.clients.cli.doctor.findings import WRONG, Checks, Report, Severity, examine
-from vram_arbiter.clients.cli.doctor.machine import (
-    Machine,
-    ask_nvml,
-    this_installation,
-    this_machine,
-)
+from vram_arbiter.clients.cli.doctor.machine import Machine, ask_nvml, this_machine
 from vram_arbiter.clients.cli.replies import NO, OK, UNREACHABLE
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 from vram_arbiter.schemas.runtime.printable import printable
-from vram_arbiter.schemas.runtime.version import version
 
 DESCRIPTIONS = {
-    "doctor": "Examine installation, driver, socket, permissions, cgroups, suspend, "
+    "doctor": "Examine driver, socket, permissions, cgroups, suspend, "
     "leftovers, a second arbiter, units, and what the arbiter says of itself and its GPUs. Each "
     "finding names a command that resolves it; nothing is changed. Exits 0 without a warning or "
     "error, 1 with one, 3 if the arbiter cannot be reached."
 }
 
 CHECKS: Final[Checks[Machine]] = (
-    ("installation", installation.origins, ""),
     ("driver", driver.driver, ""),
     ("devices", driver.devices, "the device nodes may be opened"),
     ("suspend", driver.suspend, "no suspend loses GPU memory"),
@@ -68,26 +58,20 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    return doctor(as_json=args.as_json, endpoint=args.endpoint)
-
-
-def doctor(*, as_json: bool, endpoint: str | None) -> int:
     """Examine this machine and print the report. Return the exit code."""
-    where = endpoint or arbiter_endpoint(os.environ, os.getuid())
-    installed = this_installation(str(Path(vram_arbiter.__file__).parent), version())
-    machine = this_machine(where, ask_nvml(), installed)
+    where = args.endpoint or arbiter_endpoint(os.environ, os.getuid())
+    machine = this_machine(where, ask_nvml())
     report = Report(where, examine(machine, CHECKS))
-    if as_json:
+    if args.as_json:
         print(json.dumps(to_map(report), indent=2))
     else:
-        width = terminal.columns()
-        print("\n".join(lines_of(report, color=sys.stdout.isatty(), width=width)))
+        print("\n".join(lines_of(report, width=terminal.columns())))
     if machine.arbiter.problem is not None:
         return UNREACHABLE
     return NO if any(one.severity in WRONG for one in report.findings) else OK
 
 
-def lines_of(report: Report, *, color: bool = False, width: int | None = None) -> list[str]:
+def lines_of(report: Report, *, width: int | None = None) -> list[str]:
     """Return the report as lines: severity, code, what was found; below it what fixes it.
 
     `width`: columns to which findings are folded; commands stay in one line.
@@ -96,21 +80,9 @@ def lines_of(report: Report, *, color: bool = False, width: int | None = None) -
     for one in report.findings:
         mark = f"{one.severity.upper() if one.severity in WRONG else one.severity:<8}"
         line = f"{mark} {one.code:<{_WIDTH}} {printable(one.found)}"
-        first, *more = terminal.folded(line, indent, width)
-        if color:
-            first = first.replace(mark, f"\x1b[{_COLORS[one.severity]}m{mark}\x1b[0m", 1)
-        lines += [first, *more]
+        lines += terminal.folded(line, indent, width)
         if one.fix and one.severity is not Severity.OK:
             lines.append(f"{'':<{9 + _WIDTH}} → {printable(one.fix)}")
     counts = Counter(one.severity for one in report.findings)
     said = ", ".join(f"{counts[one]} {one}" for one in Severity if counts[one])
     return [*lines, said]
-
-
-_COLORS: Final = {
-    Severity.OK: "32",
-    Severity.NOTE: "36",
-    Severity.UNKNOWN: "35",
-    Severity.WARNING: "33",
-    Severity.ERROR: "31",
-}

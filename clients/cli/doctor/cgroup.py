@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Final
 
-from vram_arbiter.clients.cli.doctor.findings import CouldNotLook, Finding, error, warning
+from vram_arbiter.clients.cli.doctor.findings import CouldNotLook, Finding, warning
 from vram_arbiter.clients.cli.doctor.machine import Machine
 from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.sizes import format_bytes
@@ -15,7 +15,7 @@ UNIT_SCORE: Final = -500
 
 
 def memory(m: Machine) -> Iterator[Finding]:
-    """No cgroup above the daemon limits it to less than it needs, or killed for it."""
+    """No cgroup above the daemon limits it to less than it needs."""
     lines = m.daemon_file("cgroup").splitlines()
     group = next(
         (one.removeprefix("0::").rstrip("/") for one in lines if one.startswith("0::")), ""
@@ -31,10 +31,6 @@ def memory(m: Machine) -> Iterator[Finding]:
                 size = format_bytes(int(limit))
                 what = f"{name} of {group} is {size}, the daemon may need 140 MiB"
                 yield warning("cgroup.limit", what, f"{lift} {key}=infinity")
-        kills = _field(m.text(f"{place}/memory.events"), "oom_kill")
-        if kills and unit.startswith("vram-arbiter"):
-            what = f"the kernel killed {kills} processes of {group} for want of memory"
-            yield error("cgroup.killed", what, f"{lift} MemoryMax=infinity")
         group = group.rpartition("/")[0]
 
 
@@ -48,11 +44,3 @@ def out_of_memory(m: Machine) -> Iterator[Finding]:
             "programs that it knows",
             f"echo {UNIT_SCORE} | {m.sudo}tee /proc/{m.arbiter.pid}/oom_score_adj",
         )
-
-
-def _field(text: str | None, name: str) -> int:
-    for line in (text or "").splitlines():
-        words = line.split()
-        if words[:1] == [name]:
-            return int(words[1])
-    return 0

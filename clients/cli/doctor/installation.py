@@ -1,4 +1,4 @@
-"""Checks of the installation: where programs come from, versions, systemd units."""
+"""Checks of the installation: versions, systemd units."""
 
 import os
 import shlex
@@ -10,7 +10,6 @@ from vram_arbiter.clients.cli.doctor.findings import (
     Finding,
     error,
     note,
-    ok,
     warning,
 )
 from vram_arbiter.clients.cli.doctor.machine import UNIT, Machine, user_folders
@@ -18,30 +17,9 @@ from vram_arbiter.clients.cli.doctor.machine import UNIT, Machine, user_folders
 SYSTEM_FOLDERS: Final = ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system")
 
 
-def origins(m: Machine) -> Iterator[Finding]:
-    """All modules are of one copy of the package, and the programs on PATH belong to it."""
-    installed = m.installed
-    yield ok("installation.origin", f"{installed.package} ({installed.version})")
-    for stray in installed.strays[:1]:
-        what = f"modules come from two copies of the package, also from {stray}"
-        yield error("installation.mixed", what, _remove(stray, installed.bin))
-    for name, place in installed.programs.items():
-        own = os.path.realpath(f"{installed.bin}/{name}")
-        if place != own and os.path.exists(own):
-            what = f"`{name}` on PATH is {place}, this installation has {own}"
-            yield warning("installation.path", what, f"{m.sudo}ln -sf {own} /usr/local/bin/{name}")
-
-
-def _remove(copy: str, bin: str) -> str:
-    """Return the command after which another copy of the package is no longer found."""
-    if "/site-packages/" in copy:
-        return f"{bin}/python -m pip uninstall vram-arbiter"
-    return "unset PYTHONPATH"
-
-
 def versions(m: Machine) -> Iterator[Finding]:
     """Client and daemon are of one version."""
-    refusal, own = m.arbiter.refusal, m.installed.version
+    refusal, own = m.arbiter.refusal, m.version
     if refusal is not None and refusal.code == "version_mismatch":
         yield error("versions.wire", refusal.message, m.service("restart"))
     elif m.arbiter.status is None:

@@ -8,9 +8,7 @@ import contextlib
 import grp
 import os
 import pwd
-import shutil
 import socket
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +20,7 @@ from vram_arbiter.schemas.codec import CodecError, from_map
 from vram_arbiter.schemas.errors import ConfigError, VramError
 from vram_arbiter.schemas.runtime.endpoints import SYSTEM_RUNTIME, socket_path
 from vram_arbiter.schemas.runtime.peercred import credentials
+from vram_arbiter.schemas.runtime.version import version
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.replies import PingReply, StatusReply
 from vram_arbiter.schemas.wire.requests import Ping, Status
@@ -54,25 +53,13 @@ class Arbiter:
     refusal: ErrorView | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Import:
-    """Where this program comes from. `strays`: modules of the package that were imported from
-    elsewhere."""
-
-    package: str
-    version: str
-    bin: str  # of this interpreter
-    strays: Sequence[str] = ()
-    programs: Mapping[str, str] = field(default_factory=dict)  # on PATH: name → resolved path
-
-
 @dataclass(frozen=True)
 class Machine:
     """All that checks may look at."""
 
     endpoint: str
     arbiter: Arbiter
-    installed: Import
+    version: str  # of this program
     nvml: Nvml = field(default_factory=Nvml)
     root: Path = Path("/")
     environ: Mapping[str, str] = field(default_factory=dict)
@@ -176,12 +163,12 @@ def user_folders(environ: Mapping[str, str]) -> tuple[str, ...]:
 
 
 # -- this machine
-def this_machine(endpoint: str, nvml: Nvml, installed: Import) -> Machine:
+def this_machine(endpoint: str, nvml: Nvml) -> Machine:
     """Look at the machine that this program runs on."""
     return Machine(
         endpoint=endpoint,
         arbiter=ask_arbiter(endpoint),
-        installed=installed,
+        version=version(),
         nvml=nvml,
         environ=os.environ,
         uid=os.geteuid(),
@@ -219,28 +206,6 @@ def _listener(endpoint: str) -> tuple[int | None, int | None]:
         except (OSError, ConfigError):
             return None, None
     return pid, uid
-
-
-def this_installation(package: str, version: str) -> Import:
-    """Look where this program and its modules lie."""
-    name = Path(package).name
-    programs = {
-        program: os.path.realpath(found)
-        for program in ("vramctl", "vram-arbiter")
-        if (found := shutil.which(program))
-    }
-    files = {
-        str(module.__file__)
-        for key, module in sys.modules.items()
-        if key.partition(".")[0] == name and getattr(module, "__file__", None)
-    }
-    return Import(
-        package=package,
-        version=version,
-        bin=os.path.dirname(sys.executable),
-        strays=tuple(sorted(file for file in files if not file.startswith(f"{package}/"))),
-        programs=programs,
-    )
 
 
 def ask_nvml() -> Nvml:

@@ -5,39 +5,26 @@ overwritten, and removed by a purge only.
 """
 
 import contextlib
-import difflib
 import hashlib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from vram_arbiter.clients.cli import files
 from vram_arbiter.clients.cli.installation.environment import writable_by_others
-from vram_arbiter.clients.cli.installation.site import GROUP, LINK, Site
+from vram_arbiter.clients.cli.installation.site import LINK, Site
 from vram_arbiter.schemas.errors import ConfigError
-
-QUIET: Final = ("same", "gone", "keep")
-"""Words of steps after which the machine is as before."""
 
 
 class Installed(BaseModel):
     """The file `installed.json`: what was put on the machine."""
 
-    model_config = ConfigDict(extra="ignore")  # earlier versions noted more
-
-    version: str = ""
-    prefix: Path = Path("/")
-    group: str = GROUP
-    operators: list[str] = []
     files: dict[Path, str] = {}
     """Path → SHA-256 of what was written, not of what is there now."""
-    folders: list[Path] = []
-    """Made for a file; removed if they are empty."""
     started: bool = False
     """The arbiter was enabled and started, once."""
 
@@ -48,37 +35,24 @@ class Step:
 
     verb: str
     what: str
-    detail: Sequence[str] = ()
     perform: Callable[[], object] | None = None
 
-    @property
-    def changes(self) -> bool:
-        """Whether the machine is changed, not only the record."""
-        return self.perform is not None and self.verb not in QUIET
 
-
-def load(site: Site) -> Installed | None:
-    """Return the record of the last installation, None without one.
+def load(site: Site) -> Installed:
+    """Return the record of the last installation, an empty one without.
 
     Raises ConfigError for a file that this version did not write, or that another user could have.
     """
     path = site.at(site.record)
     try:
-        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
-            problem = writable_by_others(os.fstat(file.fileno())) if os.getuid() == 0 else ""
-            if problem:
-                raise ConfigError(f"{path} {problem}; it says what root removes", hint="check it")
-            return Installed.model_validate_json(file.read())
+        if os.getuid() == 0 and (problem := writable_by_others(path.lstat())):
+            raise ConfigError(f"{path} {problem}; it says what root removes", hint="check it")
+        return Installed.model_validate_json(path.read_bytes())
     except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from error
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]["msg"]
+        return Installed()
+    except (OSError, ValidationError) as error:
         raise ConfigError(
-            f"{path} is not the record of an installation: {problem}",
-            hint="move it away; the next installation takes over the files that are as it would "
-            "write them",
+            f"{path} is not the record of an installation: {error}", hint="move it away"
         ) from error
 
 
@@ -89,59 +63,44 @@ class Files:
     site: Site
     record: Installed
 
-    def install(self, wanted: Mapping[Path, str]) -> list[Step]:
-        """Return the steps that bring the machine's files to what is wanted."""
+    def plan(self, wanted: Mapping[Path, str], *, purge: bool = False) -> list[Step]:
+        """Return the steps that bring the machine's files to what is wanted; a purge removes what
+        was changed by hand too."""
         steps = [self._file(path, text) for path, text in wanted.items()]
         obsolete = [path for path in self.record.files if path not in wanted]
-        return [*steps, *(self._removal(path, purge=False) for path in obsolete)]
-
-    def remove(self, *, purge: bool) -> list[Step]:
-        """Return the steps that remove what was installed; a purge removes what was changed too."""
-        return [self._removal(path, purge=purge) for path in self.record.files]
+        return [*steps, *(self._removal(path, purge=purge) for path in obsolete)]
 
     def store(self) -> None:
-        """Write the record, and the folder that it is in."""
-        self._write(self.site.record, self.record.model_dump_json(indent=2) + "\n")
-
-    def remove_folders(self) -> None:
-        """Remove the folders that were made for files and are empty."""
-        for folder in sorted(self.record.folders, reverse=True):
-            with contextlib.suppress(OSError):
-                self.site.at(folder).rmdir()
+        """Write the record, or remove that of nothing."""
+        if self.record.files:
+            self._write(self.site.record, self.record.model_dump_json(indent=2) + "\n")
+        else:
+            _unlink(self.site.at(self.site.record))
 
     def _file(self, path: Path, text: str) -> Step:
-        there = self.site.read(path)
+        there, written = self.site.read(path), self.record.files.get(path)
         put = partial(self._put, path, text)
         if there is None:
-            return Step("new", str(path), perform=put)
+            return Step("new", str(path), put)
         if there == text:
-            return Step("same", str(path), perform=partial(self._note, path, text))
-        changes, written = _diff(there, text), self.record.files.get(path)
+            self.record.files[path] = _digest(text)
+            return Step("same", str(path))
         if written == _digest(there):
-            return Step("replace", str(path), changes, put)
-        if written in (None, _digest(text)):
-            return Step("keep", f"{path}: changed by hand")
-        return Step("keep", f"{path}: changed by hand; remove it to get this version", changes)
+            return Step("replace", str(path), put)
+        return Step("keep", f"{path}: changed by hand; remove it to get this version")
 
     def _removal(self, path: Path, *, purge: bool) -> Step:
         there = self.site.read(path)
-        if there is None:
-            return Step("gone", str(path), perform=partial(self._remove, path))
-        if purge or _digest(there) == self.record.files[path]:
-            return Step("remove", str(path), perform=partial(self._remove, path))
-        forget = partial(self.record.files.pop, path, None)
-        return Step("keep", f"{path}: changed by hand", perform=forget)
+        if there is None or purge or _digest(there) == self.record.files[path]:
+            return Step("remove", str(path), partial(self._remove, path))
+        return Step("keep", f"{path}: changed by hand")
 
     def _put(self, path: Path, text: str) -> None:
         self._write(path, text)
-        self._note(path, text)
+        self.record.files[path] = _digest(text)
 
     def _write(self, path: Path, text: str) -> None:
-        for folder in reversed(path.parents):
-            place = self.site.folder(folder)
-            if not place.is_dir():
-                place.mkdir(mode=0o755)
-                self.record.folders.append(folder)
+        self.site.folder(path.parent).mkdir(mode=0o755, parents=True, exist_ok=True)
         place = self.site.at(path)
         if text.startswith(LINK):
             place.unlink(missing_ok=True)
@@ -149,18 +108,16 @@ class Files:
         else:
             files.replace(place, text)
 
-    def _note(self, path: Path, text: str) -> None:
-        self.record.files[path] = _digest(text)
-
     def _remove(self, path: Path) -> None:
-        self.site.at(path).unlink(missing_ok=True)
+        _unlink(self.site.at(path))
         self.record.files.pop(path, None)
+
+
+def _unlink(place: Path) -> None:
+    place.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # a folder that has other files
+        os.removedirs(place.parent)
 
 
 def _digest(text: str) -> str:
     return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()
-
-
-def _diff(before: str, after: str) -> list[str]:
-    lines = difflib.unified_diff(before.splitlines(), after.splitlines(), lineterm="", n=1)
-    return list(lines)[2:]  # without the names

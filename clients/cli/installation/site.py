@@ -11,31 +11,17 @@ from pathlib import Path
 from vram_arbiter.schemas.errors import ConfigError
 
 ARBITER = "vram-arbiter.service"
-CLIENTS = (
-    "vram-observer.service",
-    "vram-sidecar@.service",
-    "vram-runner@.service",
-    "vram-reasoner@.service",
-    "vram-reasoner.service",
-)
-OF_USER = (ARBITER, "vram-reasoner.service")
 PROGRAMS = (
-    "vram-arbiter",
-    "vramctl",
-    "vram-observer",
-    "vram-sidecar",
-    "vram-runner",
-    "vram-reasoner",
-)
-GROUP = "vram-arbiter"
-OPERATORS = "vram-operators"
+    "vram-arbiter", "vramctl", "vram-observer", "vram-sidecar", "vram-runner", "vram-reasoner",
+)  # fmt: skip
 LINK = "-> "
 """Begins the text of a link; its target follows."""
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
-    """Folders of one kind of installation."""
+class Site:
+    """Folders of one installation. `root` other than `/`: files alone, for another machine or an
+    image."""
 
     units: Path
     settings: Path
@@ -43,59 +29,8 @@ class Layout:
     shared: Path
     """Of the shell completions."""
     state: tuple[Path, ...]
-    """What the programs write: journals, caches, sockets."""
+    """In these each program has a folder of its name: journals, caches, sockets."""
     system: bool
-
-
-SYSTEM = Layout(
-    units=Path("/etc/systemd/system"),
-    settings=Path("/etc/vram-arbiter"),
-    programs=Path("/usr/local/bin"),
-    shared=Path("/usr/local/share"),
-    state=tuple(
-        Path(folder)
-        for folder in (
-            *(f"/var/lib/vram-{name}" for name in ("arbiter", "runner", "reasoner", "observer")),
-            "/var/lib/private/vram-observer",  # where that leads: its user exists while it runs
-            "/var/cache/vram-sidecar",
-            "/var/cache/vram-runner",
-            "/run/vram-arbiter",
-        )
-    ),
-    system=True,
-)
-
-
-def layout_of_user(environ: Mapping[str, str]) -> Layout:
-    """Return the folders of the calling user (XDG base directories). Raises ConfigError."""
-    home = Path(environ.get("HOME", ""))
-    if not home.is_absolute():
-        raise ConfigError("no home folder: HOME is not set", hint="set it, or log in")
-
-    def folder(variable: str, otherwise: str) -> Path:
-        value = environ.get(variable, "")
-        return Path(value) if value.startswith("/") else home / otherwise
-
-    settings = folder("XDG_CONFIG_HOME", ".config")
-    kept = folder("XDG_STATE_HOME", ".local/state")
-    state = [kept / "vram-arbiter", kept / "vram-observer"]
-    if runtime := environ.get("XDG_RUNTIME_DIR"):
-        state.append(Path(runtime) / "vram-arbiter")
-    return Layout(
-        units=settings / "systemd/user",
-        settings=settings / "vram-arbiter",
-        programs=home / ".local/bin",
-        shared=folder("XDG_DATA_HOME", ".local/share"),
-        state=tuple(state),
-        system=False,
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class Site:
-    """One installation. `root` other than `/`: files alone, for another machine or an image."""
-
-    layout: Layout
     root: Path = Path("/")
 
     def at(self, path: Path) -> Path:
@@ -126,6 +61,10 @@ class Site:
             return place.read_text(encoding="utf-8", errors="surrogateescape")
         return "" if place.exists() else None
 
+    def trees(self) -> list[Path]:
+        """Return the folders that a purge removes whole."""
+        return [folder / name for folder in self.state for name in PROGRAMS] + [self.settings]
+
     @property
     def live(self) -> bool:
         """Whether the services of this machine are meant."""
@@ -134,18 +73,37 @@ class Site:
     @property
     def record(self) -> Path:
         """The file that says what was installed."""
-        return self.layout.settings / "installed.json"
+        return self.settings / "installed.json"
 
 
-def is_tegra(site: Site) -> bool:
-    """Return whether the machine is a Jetson or another Tegra: its GPU has devices of its own."""
-    if site.at(Path("/etc/nv_tegra_release")).exists():
-        return True
-    try:
-        compatible = Path("/proc/device-tree/compatible").read_bytes() if site.live else b""
-    except OSError:
-        return False
-    return b"nvidia,tegra" in compatible
+SYSTEM = Site(
+    units=Path("/etc/systemd/system"),
+    settings=Path("/etc/vram-arbiter"),
+    programs=Path("/usr/local/bin"),
+    shared=Path("/usr/local/share"),
+    # the folder `private` has those of units without a user of their own
+    state=tuple(map(Path, ("/var/lib", "/var/lib/private", "/var/cache", "/run"))),
+    system=True,
+)
+
+
+def site_of_user(environ: Mapping[str, str]) -> Site:
+    """Return the folders of the calling user (XDG base directories)."""
+
+    def folder(variable: str, otherwise: str) -> Path:
+        value = environ.get(variable, "")
+        return Path(value) if value.startswith("/") else Path.home() / otherwise
+
+    settings = folder("XDG_CONFIG_HOME", ".config")
+    runtime = Path(environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}")
+    return Site(
+        units=settings / "systemd/user",
+        settings=settings / "vram-arbiter",
+        programs=Path.home() / ".local/bin",
+        shared=folder("XDG_DATA_HOME", ".local/share"),
+        state=(folder("XDG_STATE_HOME", ".local/state"), runtime),
+        system=False,
+    )
 
 
 def tegra_devices(site: Site) -> list[str]:

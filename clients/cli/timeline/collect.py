@@ -141,12 +141,8 @@ def from_log(log: Path, wanted: Range) -> Story:
 
 def read_log(log: Path) -> JsonMap:
     """Have the arbiter's program read a log. Raises BadEventLog."""
-    done = subprocess.run(
-        [sys.executable, "-m", EVENT_LOG, "story", "--json", str(log)],
-        stdout=subprocess.PIPE,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, "-m", EVENT_LOG, "story", "--json", str(log)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
     try:
         told: Message = json.loads(done.stdout)
     except ValueError as error:
@@ -174,11 +170,8 @@ def story_of(told: JsonMap, wanted: Range) -> Story:
         )
     reader = Reader(told["begin_wall_s"])
     for gpu in told["gpus"]:
-        title, reserve = (
-            f"GPU {gpu['index']} {gpu['name']}",
-            gpu.get("reserve_bytes", RESERVE_BYTES),
-        )
-        reader.gpu(gpu["id"], title, gpu["capacity_bytes"], reserve)
+        title, kept = f"GPU {gpu['index']} {gpu['name']}", gpu.get("reserve_bytes", RESERVE_BYTES)
+        reader.gpu(gpu["id"], title, gpu["capacity_bytes"], kept)
     for at_s, name, used in told["readings"]:
         reader.gpu(name).measured.append((at_s, used))
     feed = [(one["at_wall_s"], 1, one) for one in events]

@@ -72,8 +72,7 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(problem, hint="name a file in a folder that you can write") from error
     began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(story.begin_s))
     leases, evictions = plural(len(story.leases), "lease"), plural(len(story.evictions), "eviction")
-    lasted_s = story.end_s - story.begin_s
-    print(f"{out}: {lasted_s:.1f} s from {began}, {leases}, {evictions}")
+    print(f"{out}: {story.end_s - story.begin_s:.1f} s from {began}, {leases}, {evictions}")
     return OK
 
 

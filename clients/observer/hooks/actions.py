@@ -10,14 +10,13 @@ import os
 import random
 import stat
 from collections.abc import Awaitable, Callable, Mapping
-from http import HTTPStatus
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
 import httpx
 
-from vram_arbiter.clients.observer.hooks.command import GRACE_S, run_command
+from vram_arbiter.clients.observer.hooks.command import run_command
 from vram_arbiter.clients.observer.hooks.events import Delivery, environ_of
 from vram_arbiter.schemas.config.observer import Hook
 from vram_arbiter.schemas.errors import ActionFailed, ConfigError
@@ -32,12 +31,8 @@ PAUSE_MAX_S: Final = 60.0
 RETRY_AFTER_MAX_S: Final = 600.0
 HEADERS_MAX_BYTES: Final = 16 << 10
 SHOWN_MAX_CHARS: Final = 200
-AGAIN: Final = (
-    HTTPStatus.REQUEST_TIMEOUT,
-    HTTPStatus.TOO_EARLY,
-    HTTPStatus.TOO_MANY_REQUESTS,
-)
-"""Answers below 500 after which the same request may succeed."""
+AGAIN: Final = (408, 425, 429)
+"""Answers below 500 after which the same request may succeed: late, early, too many."""
 
 type Sleep = Callable[[float], Awaitable[object]]
 
@@ -45,26 +40,14 @@ type Sleep = Callable[[float], Awaitable[object]]
 async def act(hook: Hook, delivery: Delivery, endpoint: str) -> None:
     """Perform one delivery. Raises ActionFailed."""
     if hook.command is not None:
-        await run(hook, delivery, environ_of(delivery, endpoint))
+        environ = environ_of(delivery, endpoint)
+        await run_command(hook.command, delivery.body + b"\n", environ, hook.timeout_s)
     else:
         await post(hook, delivery)
 
 
-# -- commands
-async def run(
-    hook: Hook, delivery: Delivery, environ: Mapping[str, str], grace_s: float = GRACE_S
-) -> None:
-    """Run the command with the event on its stdin. Raises ActionFailed."""
-    assert hook.command is not None
-    await run_command(hook.command, delivery.body + b"\n", environ, hook.timeout_s, grace_s)
-
-
 # -- webhooks
-async def post(
-    hook: Hook,
-    delivery: Delivery,
-    sleep: Sleep = asyncio.sleep,
-) -> None:
+async def post(hook: Hook, delivery: Delivery, sleep: Sleep = asyncio.sleep) -> None:
     """Send one event until it is taken. Raises ActionFailed."""
     host, problem = _host(hook), ""
     async with httpx.AsyncClient(trust_env=False, timeout=hook.timeout_s) as client:
@@ -111,7 +94,7 @@ def read_headers(path: str) -> Mapping[str, str]:
     if stat.S_ISREG(mode) and mode & stat.S_IROTH:
         raise ConfigError(f"{path} may be read by every user", hint=f"chmod o-r {path}")
     if len(text) > HEADERS_MAX_BYTES:
-        raise ConfigError(f"{path} has more than {HEADERS_MAX_BYTES} bytes", hint="shorten it")
+        raise ConfigError(f"{path} has more than {HEADERS_MAX_BYTES} bytes")
     found = {}
     for number, line in enumerate(text.splitlines(), 1):
         name, colon, value = line.partition(":")

@@ -1,8 +1,7 @@
 """One run of a command, limited in time.
 
-The command leads a process group of its own. The group ends with it: processes that it left behind
-are killed, so that hooks never pile up; those in a session of their own are found by a variable of
-their environment. The leader is reaped last, so until then its pid names no other group. Of its
+The command leads a session of its own, and what it leaves behind ends with it, so that hooks never
+pile up: its processes are found, in whatever session, by a variable of their environment. Of its
 output the beginning is logged.
 """
 
@@ -12,8 +11,8 @@ import itertools
 import logging
 import os
 import signal
-import subprocess
 from collections.abc import Mapping, Sequence
+from io import RawIOBase
 from typing import Final
 
 from vram_arbiter.schemas.errors import ActionFailed
@@ -25,8 +24,6 @@ log = logging.getLogger(__name__)
 OUTPUT_MAX_BYTES: Final = 4096
 """Of one run; what is more is read and dropped."""
 MARK: Final = "VRAM_ARBITER_HOOK_RUN"
-READS_MAX: Final = 32
-"""After the end: a process of another user may go on writing."""
 ROUNDS: Final = 3
 """A process may fork while its kin are looked for."""
 _runs = itertools.count()
@@ -49,35 +46,24 @@ async def run_command(
     mark = f"{os.getpid()}-{next(_runs)}"
     reading, writing = os.pipe()
     os.set_blocking(reading, False)
-    output = bytearray()
-    try:
-        child = _start(command, body, {**environ, MARK: mark}, writing)
-    except BaseException:
-        os.close(reading)
-        raise
-    finally:
-        os.close(writing)
-    loop = asyncio.get_running_loop()
-    loop.add_reader(reading, _arrived, loop, reading, output)
-    pidfd = os.pidfd_open(child.pid)
-    late = False
-    try:
-        if not await _ended(pidfd, timeout_s):
-            late = True
-            _signal_group(child.pid, signal.SIGTERM)
-            await _ended(pidfd, grace_s)
-    finally:
-        _signal_group(child.pid, signal.SIGKILL)
-        code = child.wait()
-        _end_marked(f"{MARK}={mark}".encode())
-        loop.remove_reader(reading)
-        for _ in range(READS_MAX):
-            if not _read(reading, output):
-                break
-        os.close(reading)
-        os.close(pidfd)
-        if output:
-            log.info("%s: %s", command[0], printable(output.decode(errors="replace").strip()))
+    output, loop, late = bytearray(), asyncio.get_running_loop(), False
+    with os.fdopen(reading, "rb", buffering=0) as pipe:
+        child = await _start(command, body, {**environ, MARK: mark}, writing)
+        loop.add_reader(pipe, _arrived, loop, pipe, output)
+        try:
+            if late := not await _ended(child, timeout_s):
+                os.killpg(child.pid, signal.SIGTERM)
+                await _ended(child, grace_s)
+        finally:  # where it has ended, nothing here waits: a stop does not cut the delivery short
+            if child.returncode is None:
+                os.killpg(child.pid, signal.SIGKILL)
+            _end_marked(f"{MARK}={mark}".encode())
+            code = await child.wait()
+            while _read(pipe, output) and len(output) < OUTPUT_MAX_BYTES:
+                pass
+            loop.remove_reader(pipe)
+            if output:
+                log.info("%s: %s", command[0], printable(output.decode(errors="replace").strip()))
     if late:
         raise ActionFailed(f"{command[0]} was not done within {timeout_s:g} s and was ended")
     if code:
@@ -85,44 +71,46 @@ async def run_command(
         raise ActionFailed(f"{command[0]} {told}", details={"exit_code": code})
 
 
-def _start(
+async def _start(
     command: Sequence[str], body: bytes, environ: Mapping[str, str], output: int
-) -> subprocess.Popen[bytes]:
+) -> asyncio.subprocess.Process:
     given = os.memfd_create("event")  # a pipe would block on a command that does not read
     try:
         os.write(given, body)
         os.lseek(given, 0, os.SEEK_SET)
-        return subprocess.Popen(
-            list(command),
-            stdin=given,
-            stdout=output,
-            stderr=output,
-            env={**os.environ, **environ},
+        return await asyncio.create_subprocess_exec(
+            *command, stdin=given, stdout=output, stderr=output, env={**os.environ, **environ},
             start_new_session=True,
-        )
+        )  # fmt: skip
     except (OSError, ValueError) as error:
         raise ActionFailed(f"{command[0]} cannot be started: {error}") from error
     finally:
         os.close(given)
+        os.close(output)
 
 
-def _arrived(loop: asyncio.AbstractEventLoop, pipe: int, output: bytearray) -> None:
+def _arrived(loop: asyncio.AbstractEventLoop, pipe: RawIOBase, output: bytearray) -> None:
     if not _read(pipe, output):
         loop.remove_reader(pipe)  # at its end it would be readable for ever
 
 
-def _read(pipe: int, output: bytearray) -> bool:
-    """Take what has come. Return False at the end, and where nothing has."""
-    try:
-        came = os.read(pipe, OUTPUT_MAX_BYTES)
-    except BlockingIOError:
-        return False
+def _read(pipe: RawIOBase, output: bytearray) -> bool:
+    """Take what has come, and keep the beginning. Return False at the end, or if nothing has."""
+    came = pipe.read(OUTPUT_MAX_BYTES) or b""
     output += came[: OUTPUT_MAX_BYTES - len(output)]
     return bool(came)
 
 
+async def _ended(child: asyncio.subprocess.Process, timeout_s: float) -> bool:
+    """Wait until a process has ended. Return whether it did in time."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(timeout_s):
+            await child.wait()
+    return child.returncode is not None
+
+
 def _end_marked(mark: bytes) -> None:
-    """Kill the processes of one run, in whatever session they are."""
+    """Kill the processes of one run."""
     for _ in range(ROUNDS):
         pids = [int(entry.name) for entry in procfs.PROC.iterdir() if entry.name.isdecimal()]
         ended = [pid for pid in pids if _end_if_marked(pid, mark)]
@@ -140,23 +128,3 @@ def _end_if_marked(pid: int, mark: bytes) -> bool:
             signal.pidfd_send_signal(pidfd, signal.SIGKILL)
             return True
     return False
-
-
-async def _ended(pidfd: int, timeout_s: float) -> bool:
-    """Wait until a process has ended. Return whether it did in time."""
-    loop = asyncio.get_running_loop()
-    ended = asyncio.Event()
-    loop.add_reader(pidfd, ended.set)
-    try:
-        async with asyncio.timeout(timeout_s):
-            await ended.wait()
-    except TimeoutError:
-        return False
-    finally:
-        loop.remove_reader(pidfd)
-    return True
-
-
-def _signal_group(leader: int, number: signal.Signals) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(leader, number)

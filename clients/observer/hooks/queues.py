@@ -3,13 +3,13 @@
 import asyncio
 import json
 import logging
-import os
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Final
 
+from vram_arbiter.clients.cli.files import replace as replace_file
 from vram_arbiter.clients.observer.hooks.events import Delivery, matched
 from vram_arbiter.schemas import strictjson
 from vram_arbiter.schemas.codec import CodecError, from_map, to_map
@@ -65,11 +65,7 @@ class StateFile:
 
     def save(self, saved: Saved) -> None:
         """Replace the file. Raises OSError."""
-        new = self._path.with_name(f"{self._path.name}.new")
-        descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-        with open(descriptor, "w") as file:
-            json.dump(to_map(saved), file)
-        os.replace(new, self._path)
+        replace_file(self._path, json.dumps(to_map(saved)), 0o600)
 
 
 @dataclass(slots=True)

@@ -6,9 +6,10 @@ https://www.w3.org/TR/trace-context/ asks for, and handed on as ours. Pure.
 """
 
 import re
+from collections.abc import Callable
 from typing import Annotated
 
-from pydantic import BeforeValidator, Field
+from vram_arbiter.schemas.plain import JsonObject
 
 READ_MAX_CHARS = 512
 """Of a later version, with what it has behind ours: as much as OpenTelemetry's own propagators
@@ -34,9 +35,15 @@ def read(value: object) -> str | None:
     return f"00-{trace}-{span}-{int(flags, 16) & _SAMPLED:02x}"
 
 
-Traceparent = Annotated[
-    str | None,
-    BeforeValidator(read),
-    Field(description="W3C traceparent of the caller's span; one that is none is ignored."),
-]
+class _Read:
+    """Applied by pydantic, which this module does not import: clients start without it."""
+
+    def __get_pydantic_core_schema__(
+        self, source: object, handler: Callable[[object], JsonObject]
+    ) -> JsonObject:
+        before = {"type": "no-info", "function": read}
+        return {"type": "function-before", "function": before, "schema": handler(source)}
+
+
+Traceparent = Annotated[str | None, _Read()]
 """Of a request: never a reason to refuse it."""

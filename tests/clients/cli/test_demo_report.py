@@ -12,7 +12,6 @@ from vram_arbiter.clients.cli.demo_report import (
     Point,
     draw_timeline,
     read_log,
-    read_samples,
     summarise,
 )
 
@@ -67,17 +66,6 @@ def test_a_models_process_has_the_name_that_it_gave_itself() -> None:
     assert story.points == (Point(1.0, "detector", 5),)
 
 
-def test_samples_of_a_real_gpu_give_the_same_story() -> None:
-    gpu = {
-        "measured_used_bytes": 6,
-        "processes": [{"pid": 7, "used_bytes": 5}, {"pid": 9, "used_bytes": None}],
-    }
-    story = read_samples(
-        [(1.0, gpu)], {7: "grab"}, [{"kind": "oom", "at_wall_s": 12.0}], wall_offset_s=10.0
-    )
-    assert story == MemoryStory((Point(1.0, "grab", 5), Point(1.0, "pid 9", 0)), 6, (2.0,))
-
-
 def test_completed_needs_all_three_witnesses() -> None:
     assert demo_summary()["completed"]
     assert not demo_summary(truth={"held_above_table": {"red cube": False}})["completed"]
@@ -117,5 +105,7 @@ def test_a_timeline_is_drawn_even_of_nothing(tmp_path: Path) -> None:
     events = [{"kind": "revoke_asked", "at_wall_s": 101.9, "consumer": "detector"}]
     for number, told in enumerate((story, MemoryStory((), 0, ()))):
         path = tmp_path / f"{number}.png"
-        draw_timeline(path, told, 8 * GIB, events, start_s=0.5, wall_offset_s=100.0, title="t")
+        draw_timeline(
+            path, told, 8 * GIB, events, [(1.0, 5)], start_s=0.5, wall_offset_s=100.0, title="t"
+        )
         assert path.read_bytes().startswith(b"\x89PNG")

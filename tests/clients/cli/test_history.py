@@ -1,5 +1,6 @@
 """`vramctl history`: times as people write them, filters, paging, and following a real daemon."""
 
+import argparse
 import datetime
 import json
 import queue
@@ -15,7 +16,7 @@ import pytest
 
 from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients.cli import history
-from vram_arbiter.clients.cli.history import Wanted, collect, parse_since
+from vram_arbiter.clients.cli.history import Wanted, collect, since
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.wire.requests import History
 from vram_arbiter.schemas.wire.spec import LeaseSpec
@@ -39,13 +40,13 @@ NOON = datetime.datetime(2026, 11, 21, 12, 0).timestamp()
     ],
 )
 def test_times_as_people_write_them(written: str, ago_s: float) -> None:
-    assert parse_since(written, NOON) == pytest.approx(NOON - ago_s)
+    assert since(written, NOON) == pytest.approx(NOON - ago_s)
 
 
 @pytest.mark.parametrize("written", ["", "yesterday", "10", "1010", "25:00", "-3s"])
 def test_what_is_no_time_says_what_may_be_written(written: str) -> None:
-    with pytest.raises(ValueError, match="expected 90s, 10m"):
-        parse_since(written, NOON)
+    with pytest.raises(argparse.ArgumentTypeError, match="expected 90s, 10m"):
+        since(written, NOON)
 
 
 def test_a_filter_knows_kind_consumer_and_time() -> None:

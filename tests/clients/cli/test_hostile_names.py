@@ -9,6 +9,7 @@ import io
 import json
 import logging
 import unicodedata
+from argparse import Namespace
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from rich.text import Text
 
+from tests.clients.cli import test_text as said
 from vram_arbiter.arbiter import log as telemetry
 from vram_arbiter.clients.cli import demo_display, doctor, replies, text
 from vram_arbiter.schemas.errors import BadState
@@ -52,73 +54,21 @@ def poisoned(value: Any, name: str, keys: frozenset[str] | None = None) -> Any:
     return name if isinstance(value, str) else value
 
 
-GPU = {
-    "gpu": "GPU-1",
-    "index": 0,
-    "name": "Simulated GPU",
-    "capacity_bytes": 8 * GIB,
-    "reserve_bytes": GIB,
-    "charged_bytes": 5 * GIB,
+GPU = said.GPU | {
     "stowaway_bytes": GIB,
-    "measured_used_bytes": 6 * GIB,
-    "sample_age_s": 0.4,
-    "pressure_bytes": 0,
     "blocked": {"code": "pressure", "text": "pressure"},
     "processes": [
         {"pid": 8, "name": "Xorg", "used_bytes": GIB, "residue_bytes": 0, "stowaway": True},
         {"pid": 7, "name": "python", "used_bytes": GIB, "residue_bytes": GIB, "stowaway": False},
     ],
 }
-LEASE = {
-    "lease_id": "L1-1",
-    "state": "held",
-    "consumer": "detector",
-    "model": "m@r1",
-    "gpu": "GPU-1",
-    "priority": 50,
-    "evictable": True,
-    "charge_bytes": 5 * GIB,
-    "uses": 1,
-    "pid": 7,
-    "since_s": 61.0,
-}
-STATUS = {
-    "epoch": 3,
-    "phase": "serving",
-    "uptime_s": 720.0,
+STATUS = said.STATUS | {
     "drained": "uid 1000",
     "problems": ["the journal cannot be written"],
     "gpus": [GPU],
-    "leases": [LEASE, {**LEASE, "state": "queued", "position": 1}],
-    "clients": 1,
+    "leases": [said.LEASE, said.LEASE | {"state": "queued", "position": 1}],
 }
-WHY = {
-    "consumer": "grab",
-    "leases": [
-        {
-            "lease_id": "L1-3",
-            "state": "queued",
-            "text": "grab waits",
-            "needed_bytes": GIB,
-            "free_bytes": GIB,
-            "deficit_bytes": GIB,
-            "blockers": [
-                {
-                    "lease_id": "L1-1",
-                    "consumer": "x",
-                    "bytes": GIB,
-                    "state": "held",
-                    "condition": "in_use",
-                    "text": "in use",
-                }
-            ],
-            "next": "it unloads",
-            "plan": [{"text": "x leaves"}],
-            "eta_s": 1.0,
-            "eta_source": "learnt",
-        }
-    ],
-}
+WHY = {"consumer": "grab", "leases": [said.WAITS | {"plan": [{"text": "x leaves"}]}]}
 EVENT = {
     "seq": 1,
     "at_wall_s": 1.0,
@@ -154,7 +104,7 @@ SAID: dict[str, Callable[[str], list[str]]] = {
     "by hand": lambda name: [
         line
         for action in ("pin", "unpin", "evict")
-        for line in text.by_hand_lines(action, {"lease": poisoned(LEASE, name)})
+        for line in text.by_hand_lines(action, {"lease": poisoned(said.LEASE, name)})
     ],
     "drained": lambda name: text.by_hand_lines("drain", {"drained": name}),
     "event": lambda name: [text.event_line(poisoned(EVENT, name))],
@@ -267,7 +217,7 @@ def test_doctor_quotes_what_the_arbiter_said(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: object
 ) -> None:
     monkeypatch.setenv("VRAM_ARBITER_ENDPOINT", f"ipc://{tmp_path}/{HOSTILE}".replace("\0", ""))
-    doctor.doctor(as_json=False, endpoint=None)
+    doctor.run(Namespace(as_json=False, endpoint=None))
     said = capsys.readouterr()
     assert "\\x1b]0;owned" in said.out
     assert not obeyed(said.out)

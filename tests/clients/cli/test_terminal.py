@@ -28,11 +28,10 @@ def test_a_line_is_folded_below_its_own_text() -> None:
     assert terminal.folded(f"at {long}", 4, 40) == ["at", f"    {long}"], "a name stays whole"
 
 
-@pytest.mark.parametrize("color", [False, True])
-def test_the_doctor_folds_findings_and_no_command(color: bool) -> None:
+def test_the_doctor_folds_findings_and_no_command() -> None:
     """A command is to be copied: a line break in it would be typed."""
     report = Report("ipc:///x", (error("socket.dead", "no arbiter " * 12, FIX),))
-    first, *more = lines_of(report, color=color, width=80)[1:-1]
+    first, *more = lines_of(report, width=80)[1:-1]
     assert "no arbiter" in first
     assert len(more) > 1
     assert all(len(line) <= 80 for line in more[:-1])

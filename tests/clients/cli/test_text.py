@@ -49,6 +49,15 @@ STATUS = {
     "leases": [LEASE],
     "clients": 1,
 }
+WAITS = {
+    "lease_id": "L1-3", "state": "queued", "needed_bytes": 4 * GIB, "free_bytes": 3 * GIB,
+    "deficit_bytes": GIB, "condition": "making_room",
+    "blockers": [
+        {"lease_id": "L1-1", "consumer": "detector", "bytes": 5 * GIB, "state": "revoking",
+         "uses": 1, "condition": "in_use", "text": "1 use running"},
+    ],
+    "next": "it unloads", "eta_s": 1.25, "eta_source": "learnt", "text": "grab needs room",
+}  # fmt: skip
 
 
 def test_status() -> None:
@@ -126,29 +135,7 @@ def test_status_of_a_gpu_in_trouble() -> None:
 
 
 def test_why_somebody_waits() -> None:
-    blocker = {
-        "lease_id": "L1-1",
-        "consumer": "detector",
-        "bytes": 5 * GIB,
-        "state": "revoking",
-        "uses": 1,
-        "condition": "in_use",
-        "text": "1 use running",
-    }
-    entry = {
-        "lease_id": "L1-3",
-        "state": "queued",
-        "needed_bytes": 4 * GIB,
-        "free_bytes": 3 * GIB,
-        "deficit_bytes": GIB,
-        "condition": "making_room",
-        "blockers": [blocker],
-        "next": "it unloads",
-        "eta_s": 1.25,
-        "eta_source": "learnt",
-        "text": "grab needs room",
-    }
-    assert text.why_lines({"consumer": "grab", "leases": [entry]}) == [
+    assert text.why_lines({"consumer": "grab", "leases": [WAITS]}) == [
         "grab needs room",
         "  lease     L1-3, queued",
         "  bytes     needs 4 GiB, free 3 GiB, missing 1 GiB",
@@ -157,7 +144,7 @@ def test_why_somebody_waits() -> None:
         "  expected  in 1.2 s (learnt)",
     ]
     unknown = text.why_lines(
-        {"consumer": "grab", "leases": [entry | {"eta_s": None, "eta_source": "none"}]}
+        {"consumer": "grab", "leases": [WAITS | {"eta_s": None, "eta_source": "none"}]}
     )
     assert unknown[-1] == "  expected  unknown"
 
@@ -174,28 +161,9 @@ def test_drift_is_a_column_only_where_somebody_drifts() -> None:
 
 
 def test_why_tells_what_is_planned() -> None:
-    plan = [
-        {
-            "action": "ask",
-            "in_s": 1.2,
-            "text": "asks detector in 1.2 s, when its minimum residency ends",
-        }
-    ]
-    entry = {
-        "lease_id": "L1-2",
-        "state": "queued",
-        "needed_bytes": 4 << 30,
-        "free_bytes": 0,
-        "deficit_bytes": 4 << 30,
-        "blockers": [],
-        "next": "waits for detector",
-        "plan": plan,
-        "eta_s": None,
-        "eta_source": "none",
-        "text": "t",
-    }
-    lines = text.why_lines({"consumer": "grab", "leases": [entry]})
-    assert "  then      asks detector in 1.2 s, when its minimum residency ends" in lines
+    told = "asks detector in 1.2 s, when its minimum residency ends"
+    entry = WAITS | {"plan": [{"action": "ask", "in_s": 1.2, "text": told}]}
+    assert f"  then      {told}" in text.why_lines({"consumer": "grab", "leases": [entry]})
 
 
 def test_why_tells_what_was_measured_before() -> None:

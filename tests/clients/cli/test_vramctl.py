@@ -59,25 +59,6 @@ def test_errors_are_json_where_json_was_asked_for(nowhere: dict[str, str]) -> No
     assert (done.returncode, json.loads(done.stdout)["error"]["code"]) == (3, "arbiter_unreachable")
 
 
-@pytest.mark.e2e
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["bogus"],
-        ["why"],
-        ["status", "--bogus"],
-        ["status", "extra"],
-        ["run", "true"],
-        ["run", "--vram", "5XB", "true"],
-        ["run", "--vram", "1GiB", "--on-revoke", "kill", "true"],
-    ],
-)
-def test_2_for_wrong_usage(command: list[str], nowhere: dict[str, str]) -> None:
-    done = vramctl(*command, environ=nowhere)
-    assert done.returncode == 2
-    assert "usage: vramctl" in done.stderr
-
-
 def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) -> None:
     done = vramctl("--help", environ=nowhere)
     assert done.returncode == 0
@@ -149,13 +130,10 @@ def test_help_uses_the_width_of_the_terminal(nowhere: dict[str, str]) -> None:
 
 
 @pytest.mark.e2e
-def test_doctor_says_where_the_product_lies(nowhere: dict[str, str]) -> None:
+def test_doctor_without_an_arbiter(nowhere: dict[str, str]) -> None:
     done = vramctl("doctor", "--json", environ=nowhere)
     findings = {one["code"]: one for one in json.loads(done.stdout)["findings"]}
     assert done.returncode == 3
-    root = Path(__file__).parents[3]
-    assert findings["installation.origin"]["severity"] == "ok"
-    assert str(root / "src/vram_arbiter") in findings["installation.origin"]["found"]
     assert findings["socket.missing"]["severity"] == "error"
 
 

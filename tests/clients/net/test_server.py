@@ -13,6 +13,7 @@ from tests.support.wire import WireClient
 from vram_arbiter.clients.net.server import Peer, RouterServer, check_free
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError, RobotFault, VramError
+from vram_arbiter.schemas.goals import CancelGoal
 from vram_arbiter.schemas.plain import Message
 
 ANSWER = bytes(16 << 20)  # far more than the kernel takes in one go
@@ -100,7 +101,7 @@ def test_words_that_utf8_has_no_bytes_for_reach_the_other_side(tmp_path: Path) -
             serving = asyncio.create_task(server.serve(handle))
             async with RunnerClient(endpoint) as client:
                 with pytest.raises(RobotFault) as raised:
-                    await client.call("cancel", {"goal_id": "smoke \udcff"})
+                    await client.call(CancelGoal(goal_id="smoke \udcff"))
             serving.cancel()
             await asyncio.gather(serving, return_exceptions=True)
         return heard[-1], raised.value.message

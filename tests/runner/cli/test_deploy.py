@@ -21,6 +21,7 @@ from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.cli.deploy import claim
 from vram_arbiter.schemas.config.robot import HalConfig, RobotEnvironment
 from vram_arbiter.schemas.errors import AlreadyRunning, EstopRequested, InternalError
+from vram_arbiter.schemas.goals import PingRunner
 
 pytestmark = [pytest.mark.anyio, pytest.mark.heavy, pytest.mark.e2e]
 
@@ -114,7 +115,7 @@ async def stopped(client: RunnerClient, reason: str) -> None:
 
     A loop that stands still for a second is told of as one that hangs, and obeys when it goes on.
     """
-    await client.call("ping")  # it may have to come up first
+    await client.call(PingRunner())  # it may have to come up first
     while True:
         try:
             await client.estop(reason)
@@ -131,7 +132,7 @@ async def test_a_signal_cancels_the_goal_and_ends_in_order(
     process = start()
 
     async with client_of(tmp_path) as client:
-        assert (await client.call("ping"))["robot"] == "bench"
+        assert (await client.call(PingRunner()))["robot"] == "bench"
         picture = await client.frame(max_age_ms=5000, encoding="png")
         assert (picture["camera"], picture["width"], picture["height"]) == ("front", WIDTH, HEIGHT)
         goal = await under_way(client)

@@ -15,6 +15,7 @@ from tests.runner.grab_programs import GOAL_S, GRAB, SKILL, GrabPrograms, need_c
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.schemas.goals import PingRunner
 from vram_arbiter.schemas.wire.replies import StatusReply
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(340)]
@@ -76,7 +77,7 @@ async def interrupted_grab(arbiter: ArbiterProcess, programs: GrabPrograms) -> N
         RunnerClient(f"ipc://{arbiter.runtime}/runner.sock", connect_timeout_s=60.0) as runner,
         AsyncClient("watcher", endpoint=arbiter.endpoint) as watcher,
     ):
-        assert (await runner.call("ping"))["arbiter"] is True
+        assert (await runner.call(PingRunner()))["arbiter"] is True
         begun = await runner.state()
         goal = await runner.send_goal(GRAB, prompt="grab the red cube", deadline_s=GOAL_S)
         async for feedback in goal.feedback():

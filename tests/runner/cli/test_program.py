@@ -17,6 +17,7 @@ from vram_arbiter.runner.__main__ import main, parse
 from vram_arbiter.runner.cli.common import sidecars_given
 from vram_arbiter.runner.goals.catalogue import sidecar_endpoint
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.goals import PingRunner
 
 pytestmark = pytest.mark.anyio
 
@@ -57,8 +58,8 @@ def test_a_signal_ends_it_in_order_and_the_video_is_whole(
 
     async def use() -> None:
         async with RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=60.0) as client:
-            assert (await client.call("ping"))["pid"] == process.pid
-            frame = await client.call("frame", {"encoding": "png", "max_age_ms": 60_000.0})
+            assert (await client.call(PingRunner()))["pid"] == process.pid
+            frame = await client.frame(encoding="png", max_age_ms=60_000.0)
             assert frame["data"].startswith(b"\x89PNG")
             truth = await client.ground_truth()
             assert truth["target"] in truth["objects"]

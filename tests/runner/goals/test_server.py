@@ -28,9 +28,9 @@ from vram_arbiter.schemas.errors import (
     EstopRequested,
     GoalRejected,
     ManifestInvalid,
-    UnknownOp,
     UnknownSkill,
 )
+from vram_arbiter.schemas.goals import GetResult
 from vram_arbiter.schemas.manifest import Kind, load_manifest
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
@@ -68,7 +68,7 @@ async def test_a_goal_feeds_back_and_ends_with_one_result(b: Bench, client: Runn
     assert result["data"]["steps"] == 4
     assert states
     assert b.made[0].story == ["start end", "finish"]
-    again = await client.call("result", {"goal_id": goal.goal_id})
+    again = await client.call(GetResult(goal_id=goal.goal_id))
     assert again["status"] == "succeeded"
 
 
@@ -120,7 +120,7 @@ async def test_a_result_that_no_wire_carries_still_reaches_the_client(
     result = await goal.result(60)
     assert result["success"]
     assert "seen" in result["data"]["unsendable"]
-    assert (await client.call("result", {"goal_id": goal.goal_id}))["status"] == "succeeded"
+    assert (await client.call(GetResult(goal_id=goal.goal_id)))["status"] == "succeeded"
 
 
 async def test_no_goal_is_accepted_once_the_control_loop_has_ended(
@@ -247,7 +247,7 @@ async def test_a_client_that_vanished_finds_its_result(client: RunnerClient, end
         await gone.send_goal(RSKILL, prompt="end", goal_id="mine")
     while True:
         try:
-            result = await client.call("result", {"goal_id": "mine"})
+            result = await client.call(GetResult(goal_id="mine"))
             break
         except BadState:  # still running
             await asyncio.sleep(0.02)
@@ -294,7 +294,7 @@ async def test_a_goal_sent_from_ever_new_connections_is_told_on_the_newest(
         assert len(b.server._goals._running.peers) == LISTENERS_MAX
         await again.cancel()
         assert (await again.result(60))["status"] == "canceled"
-    assert (await client.call("result", {"goal_id": goal.goal_id}))["status"] == "canceled"
+    assert (await client.call(GetResult(goal_id=goal.goal_id)))["status"] == "canceled"
 
 
 async def test_reads(client: RunnerClient, bench: Any) -> None:
@@ -308,7 +308,7 @@ async def test_reads(client: RunnerClient, bench: Any) -> None:
     assert state["phase"] == "idle"
     assert state["world"]["base_pose"]["frame_id"] == "map"
     with pytest.raises(BadRequest, match="no camera 'rear'"):
-        await client.call("frame", {"camera": "rear"})
+        await client.frame("rear")
 
 
 @pytest.mark.parametrize(
@@ -432,9 +432,7 @@ async def test_a_goal_runs_when_it_has_the_arm_and_not_before(
 
 
 async def test_an_answer_does_not_repeat_a_mebibyte_of_mistakes(client: RunnerClient) -> None:
-    with pytest.raises(UnknownOp) as unknown:
-        await client.call("x" * 1_000_000)
-    with pytest.raises(BadRequest) as wrong:
-        await client.call("state", {"k" * 1_000_000: 0})
-    assert len(str(unknown.value)) < 1000
-    assert len(str(wrong.value)) < 1000
+    for wrong in ({"op": "x" * 1_000_000}, {"op": "state", "k" * 1_000_000: 0}):
+        reply = await client._rpc.exchange(wrong, 60)
+        assert reply["ok"] is False
+        assert len(str(reply)) < 1000

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from tests.support.waiting import until
-from vram_arbiter.clients.observer.hooks import actions
 from vram_arbiter.clients.observer.hooks.actions import post, read_headers, retry_after_s
+from vram_arbiter.clients.observer.hooks.command import run_command
 from vram_arbiter.clients.observer.hooks.events import Delivery
 from vram_arbiter.schemas.config.observer import Hook
 from vram_arbiter.schemas.errors import ActionFailed, ConfigError
@@ -22,15 +22,9 @@ from vram_arbiter.schemas.runtime import procfs
 DELIVERY = Delivery("h", "granted", {"seq": 5, "kind": "granted"}, "n-5-h", 2)
 
 
-def command(*words: str, timeout_s: float = 60.0) -> Hook:
-    return Hook.model_validate(
-        {"name": "h", "on": "granted", "command": words, "timeout_s": timeout_s}
-    )
-
-
 def run(script: str, timeout_s: float = 60.0, delivery: Delivery = DELIVERY) -> None:
-    hook = command("sh", "-c", script, timeout_s=timeout_s)
-    asyncio.run(actions.run(hook, delivery, {"WORD": "y"}, grace_s=0.05))
+    command = ("sh", "-c", script)
+    asyncio.run(run_command(command, delivery.body, {"WORD": "y"}, timeout_s, grace_s=0.05))
 
 
 def gone(file: Path) -> bool:
@@ -42,7 +36,7 @@ def gone(file: Path) -> bool:
 def test_a_command_gets_event_and_variables(tmp_path: Path) -> None:
     long = Delivery("h", "granted", {"text": "x" * 200_000}, "k")
     run(f"cat > {tmp_path}/a; echo $WORD >> {tmp_path}/a", delivery=long)
-    assert (tmp_path / "a").read_text() == f"{long.body.decode()}\ny\n"
+    assert (tmp_path / "a").read_text() == f"{long.body.decode()}y\n"
 
 
 @pytest.mark.parametrize(
@@ -55,7 +49,7 @@ def test_a_command_that_fails_says_how(script: str, problem: str) -> None:
 
 def test_a_command_that_cannot_be_started() -> None:
     with pytest.raises(ActionFailed, match="/nowhere cannot be started"):
-        asyncio.run(actions.run(command("/nowhere"), DELIVERY, {}))
+        asyncio.run(run_command(["/nowhere"], b"", {}, 60.0))
 
 
 def test_a_command_that_ignores_sigterm_is_killed_with_its_children(tmp_path: Path) -> None:
@@ -70,15 +64,8 @@ def test_what_a_command_leaves_behind_ends_with_it(tmp_path: Path) -> None:
     until(lambda: gone(tmp_path / "pid"))
 
 
-def test_what_it_leaves_in_a_session_of_its_own_ends_too(tmp_path: Path) -> None:
-    """It was in no group that is killed, and outlived every run."""
-    left = f"setsid sh -c 'echo $$ > {tmp_path}/pid; exec sleep 600' &"
-    run(f"{left} until [ -s {tmp_path}/pid ]; do sleep 0.01; done")
-    until(lambda: gone(tmp_path / "pid"))
-
-
 def test_all_that_it_leaves_is_ended(tmp_path: Path) -> None:
-    """The search goes on behind the first process with the mark."""
+    """In sessions of their own they were in no group that is killed, and outlived every run."""
     left = f"setsid sh -c 'echo $$ > {tmp_path}/$0; exec sleep 600' $one &"
     wait = f"until [ -s {tmp_path}/$one ]; do sleep 0.01; done"
     run(f"for one in a b c; do {left} {wait}; done")
@@ -127,9 +114,7 @@ def test_the_output_of_a_command_is_bounded_and_escaped(caplog: pytest.LogCaptur
 def test_a_canceled_command_is_killed(tmp_path: Path) -> None:
     async def test() -> None:
         script = f"echo $$ > {tmp_path}/new; mv {tmp_path}/new {tmp_path}/pid; sleep 600"
-        running = asyncio.create_task(
-            actions.run(command("sh", "-c", script, timeout_s=600.0), DELIVERY, {})
-        )
+        running = asyncio.create_task(run_command(["sh", "-c", script], b"", {}, 600.0))
         while not (tmp_path / "pid").exists():
             await asyncio.sleep(0.005)
         running.cancel()

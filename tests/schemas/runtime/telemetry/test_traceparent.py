@@ -6,9 +6,10 @@ from typing import Any
 
 import msgpack
 import pytest
+from pydantic import TypeAdapter
 
 from vram_arbiter.arbiter.rpc.codec import decode
-from vram_arbiter.schemas.goals import RUNNER_REQUEST
+from vram_arbiter.schemas.goals import RunnerRequest
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.runtime.telemetry.traceparent import read
 from vram_arbiter.schemas.sidecar import ENDPOINT_REQUEST, OP_REQUEST
@@ -65,7 +66,7 @@ def test_no_request_is_refused_for_it(given: object, kept: str | None) -> None:
     more than 64 characters."""
     image = b"\x89PNG\r\n\x1a\n"
     messages: list[tuple[Any, dict[str, Any]]] = [
-        (RUNNER_REQUEST, {"op": "goal", "id": 1, "goal_id": "g", "rskill_id": "a/b"}),
+        (TypeAdapter(RunnerRequest), {"op": "goal", "id": 1, "goal_id": "g", "rskill_id": "a/b"}),
         (OP_REQUEST, {"op": "detect", "image": image, "query": "cube"}),
         (ENDPOINT_REQUEST, {"endpoint": "reset"}),
     ]
