@@ -16,7 +16,7 @@ from typing import Any, Literal, is_typeddict
 from pydantic import BaseModel, TypeAdapter
 
 from vram_arbiter import schemas
-from vram_arbiter.schemas import wire
+from vram_arbiter.schemas import goals, wire
 from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.wire import requests
 
@@ -112,6 +112,9 @@ def _as_sent(model: Any, schema: JsonObject) -> None:
         key, value = tag
         schema["properties"] = {key: {"const": value}, **schema.get("properties", {})}
         schema["required"] = sorted([key, *schema.get("required", ())])
+    if issubclass(model, goals.RunnerCall):  # their defaults are for those who build them
+        schema["properties"]["id"].pop("default")
+        schema["required"] = sorted({"id", "op", *schema.get("required", ())})
     if issubclass(model, requests.Request):
         envelope = TypeAdapter(requests.Envelope).json_schema()
         schema["properties"].update(envelope["properties"])

@@ -27,6 +27,7 @@ from vram_arbiter.runner.recording.recorder import Marked, Verdict
 from vram_arbiter.runner.safety.estop import OBEY_S, EstopServer
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import (
+    BadRequest,
     BadState,
     GoalRejected,
     InternalError,
@@ -168,6 +169,8 @@ class GoalServer:
     async def _handle(self, peer: Peer, message: Message) -> None:
         request_id = message.get("id") if isinstance(message.get("id"), int) else None
         try:
+            if "id" not in message:
+                raise BadRequest("the request has no id", hint="a number that its reply repeats")
             reply = await self._answer(peer, parsed(message, RUNNER_REQUEST, OPS))
         except VramError as error:
             await self._send(peer, refusal(request_id, error))

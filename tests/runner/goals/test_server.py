@@ -323,6 +323,7 @@ async def test_reads(client: RunnerClient, bench: Any) -> None:
         ({**GOAL, "rskill_id": "a/b"}, "unknown_skill"),
         ({"op": "ping", "id": 1, "extra": 1}, "bad_request"),
         ({"op": "ping", "id": "one"}, "bad_request"),
+        ({"op": "ping"}, "bad_request"),  # whom would an answer be told?
         ({"op": "cancel", "id": 1, "goal_id": "none"}, "bad_request"),
         ({"op": "result", "id": 1, "goal_id": "none"}, "bad_request"),
     ],
