@@ -9,8 +9,7 @@ from vram_arbiter.schemas.ids import ClientId
 GIB = d.GIB
 
 
-def test_revoke_is_sent_again_until_acknowledged() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_revoke_is_sent_again_until_acknowledged(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     det.use_begin(lease)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
@@ -45,8 +44,7 @@ def test_revoke_is_sent_again_until_acknowledged() -> None:
     assert driver.state(waiter) == "queued"
 
 
-def test_a_waiter_that_is_patient_waits_past_the_deadline() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_waiter_that_is_patient_waits_past_the_deadline(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     det.use_begin(lease)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
@@ -76,8 +74,7 @@ def test_a_holder_that_does_not_answer_at_the_deadline_no_longer_counts_as_leavi
     driver.until(lambda: driver.state(waiter) == "loading")
 
 
-def test_a_voluntary_release_while_asked_is_as_good() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_voluntary_release_while_asked_is_as_good(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     assert driver.state(lease) == "revoking"
@@ -87,8 +84,7 @@ def test_a_voluntary_release_while_asked_is_as_good() -> None:
     assert driver.state(lease) == "over"
 
 
-def test_death_while_asked_counts_as_leaving() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_death_while_asked_counts_as_leaving(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     vlm = driver.consumer("vlm")
     waiter = vlm.acquire(5 * GIB)

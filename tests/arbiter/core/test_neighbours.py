@@ -8,10 +8,9 @@ from vram_arbiter.schemas import defaults as d
 GIB = d.GIB
 
 
-def test_1_freed_is_not_free_yet() -> None:
+def test_1_freed_is_not_free_yet(driver: CoreDriver) -> None:
     """llama-swap#97, ollama#9160, comfyui-mcp#2050: the next load starts before the driver returns
     the memory."""
-    driver = CoreDriver(8 * GIB)
     driver.device.lag_s = 1.5
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
@@ -24,8 +23,7 @@ def test_1_freed_is_not_free_yet() -> None:
     )
 
 
-def test_1_a_failed_poll_prints_nothing_and_frees_nothing() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_1_a_failed_poll_prints_nothing_and_frees_nothing(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     det.unloading(lease)
@@ -37,9 +35,8 @@ def test_1_a_failed_poll_prints_nothing_and_frees_nothing() -> None:
     assert driver.gpu()["measured_used_bytes"] is None
 
 
-def test_5_a_big_waiter_does_not_block_small_ones_that_fit() -> None:
+def test_5_a_big_waiter_does_not_block_small_ones_that_fit(driver: CoreDriver) -> None:
     """ollama#5724, #14578, #7758: head-of-line blocking."""
-    driver = CoreDriver(8 * GIB)
     busy, lease = held(driver, "busy", 2)
     busy.use_begin(lease)
     big = driver.consumer("big").acquire(6 * GIB)
@@ -48,8 +45,7 @@ def test_5_a_big_waiter_does_not_block_small_ones_that_fit() -> None:
     assert (driver.state(big), driver.state(small)) == ("queued", "loading")
 
 
-def test_5_and_small_ones_do_not_starve_the_big_one() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_5_and_small_ones_do_not_starve_the_big_one(driver: CoreDriver) -> None:
     busy, lease = held(driver, "busy", 4)
     busy.use_begin(lease)
     big = driver.consumer("big").acquire(6 * GIB)
@@ -66,9 +62,8 @@ def test_5_and_small_ones_do_not_starve_the_big_one() -> None:
     driver.until(lambda: driver.state(big) == "loading", limit_s=5.0)
 
 
-def test_8_two_loads_at_once_mis_measure_each_other() -> None:
+def test_8_two_loads_at_once_mis_measure_each_other(driver: CoreDriver) -> None:
     """vLLM#55827, #56830, ollama#13235: so one GPU loads one model at a time, even if both fit."""
-    driver = CoreDriver(8 * GIB)
     a, b = driver.consumer("a"), driver.consumer("b")
     first, second = a.acquire(2 * GIB), b.acquire(2 * GIB)
     driver.advance(5.0)
@@ -77,9 +72,8 @@ def test_8_two_loads_at_once_mis_measure_each_other() -> None:
     driver.until(lambda: driver.state(second) == "loading", limit_s=0.1)
 
 
-def test_9_a_busy_model_is_never_evicted() -> None:
+def test_9_a_busy_model_is_never_evicted(driver: CoreDriver) -> None:
     """llama.cpp#21678, #24849: the request in flight dies with its model."""
-    driver = CoreDriver(8 * GIB)
     busy, lease = held(driver, "busy", 5)
     busy.use_begin(lease, "request")
     waiter = driver.consumer("w").acquire(5 * GIB, priority=100)
@@ -92,9 +86,8 @@ def test_9_a_busy_model_is_never_evicted() -> None:
     driver.until(lambda: driver.state(waiter) == "loading")
 
 
-def test_13_two_claims_of_six_on_a_gpu_of_eight() -> None:
+def test_13_two_claims_of_six_on_a_gpu_of_eight(driver: CoreDriver) -> None:
     """taOS#1992: both pass."""
-    driver = CoreDriver(8 * GIB)
     first = driver.consumer("a").acquire(6 * GIB, evictable=False)
     assert driver.state(first) == "loading"
     second = driver.consumer("b").acquire(6 * GIB, wait_timeout_s=5.0)
@@ -113,8 +106,7 @@ def test_13_leases_are_not_subtracted_from_a_free_figure_that_includes_them() ->
     assert driver.state(driver.consumer("b").acquire(4 * GIB)) == "loading"
 
 
-def test_13_a_renewal_never_resurrects() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_13_a_renewal_never_resurrects(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, ttl_s=5.0)
     token = det.token(lease)
     driver.advance(5.1)
@@ -124,8 +116,7 @@ def test_13_a_renewal_never_resurrects() -> None:
     assert driver.gpu()["charged_bytes"] == 5 * GIB, "and its bytes stay charged: it holds them"
 
 
-def test_13_a_probe_failure_is_not_free_memory() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_13_a_probe_failure_is_not_free_memory(driver: CoreDriver) -> None:
     driver.device.failing = "NVML_ERROR_UNKNOWN"
     driver.advance(1.1)
     waiter = driver.consumer("a").acquire(1 * GIB)

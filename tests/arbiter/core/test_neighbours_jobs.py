@@ -8,13 +8,12 @@ from vram_arbiter.schemas import defaults as d
 GIB = d.GIB
 
 
-def test_3_a_hung_holder_is_not_stopping_for_ever() -> None:
+def test_3_a_hung_holder_is_not_stopping_for_ever(driver: CoreDriver) -> None:
     """ollama#7606, #12179, llama-swap#125: "Stopping…" until it is killed by hand.
 
     Here the hung holder's lease expires, and its death or the measurement gives its bytes back.
     The waiter is told all the while which holder it waits for.
     """
-    driver = CoreDriver(8 * GIB)
     policy = driver.consumer("policy")
     lease = policy.acquire(5 * GIB, ttl_s=10.0)
     policy.load(lease)

@@ -40,10 +40,9 @@ def test_4_two_models_that_are_wanted_alike_do_not_load_all_the_time() -> None:
     assert calm <= 22, "at least half of the time they work"
 
 
-def test_4_equals_take_turns_at_safe_points() -> None:
+def test_4_equals_take_turns_at_safe_points(driver: CoreDriver) -> None:
     """The second of two equals waited for ever. Each stays for its minimum residency at least, and
     finishes its use."""
-    driver = CoreDriver(8 * GIB)
     people = {name: driver.consumer(name) for name in ("a", "b")}
     leases = {name: one.acquire(5 * GIB, min_residency_s=2.0) for name, one in people.items()}
     for name, other in (("a", "b"), ("b", "a"), ("a", "b")):
@@ -78,10 +77,9 @@ def test_4_an_idle_holder_does_not_keep_a_gpu_for_minutes(priority: int) -> None
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
 
 
-def test_4_nobody_starves_behind_leases_that_come_back_by_themselves() -> None:
+def test_4_nobody_starves_behind_leases_that_come_back_by_themselves(driver: CoreDriver) -> None:
     """Standby leases that return all the time never stand in a waiter's way for longer than the
     load that is under way."""
-    driver = CoreDriver(8 * GIB)
     people = [held(driver, f"s{n}", 2, standby=True, min_residency_s=0.5) for n in range(3)]
     waiting = driver.consumer("low").acquire(7 * GIB, priority=0)
     began = driver.now
@@ -104,9 +102,8 @@ def test_6_the_single_coldest_that_covers_the_need_leaves() -> None:
     assert [gib for gib, lease in leases.items() if driver.state(lease) == "revoking"] == [4]
 
 
-def test_10_nothing_that_comes_back_touches_a_pinned_model() -> None:
+def test_10_nothing_that_comes_back_touches_a_pinned_model(driver: CoreDriver) -> None:
     """llama.cpp PR#18373, llama-swap#1127."""
-    driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 4, standby=True)
     boss = driver.consumer("boss")
     wanted = boss.acquire(5 * GIB, evictable=False)

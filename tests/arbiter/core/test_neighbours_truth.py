@@ -120,9 +120,8 @@ def test_1_a_holder_that_the_driver_cannot_list_is_not_charged_twice() -> None:
     assert (driver.gpu()["charged_bytes"], driver.gpu()["stowaway_bytes"]) == (4 * GIB, GIB)
 
 
-def test_1_a_recovery_that_never_comes_is_not_admitted_after_a_while() -> None:
+def test_1_a_recovery_that_never_comes_is_not_admitted_after_a_while(driver: CoreDriver) -> None:
     """ollama: "gpu VRAM usage didn't recover within timeout", and then loads all the same."""
-    driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     det.unloading(lease)
@@ -149,8 +148,7 @@ def test_2_an_unload_that_frees_a_fraction_is_charged_for_the_rest_and_named() -
     assert "det" in driver.why("vlm")["leases"][0]["text"]
 
 
-def test_2_what_a_process_keeps_is_learnt() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_2_what_a_process_keeps_is_learnt(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 4, residue_bytes=450 * MIB)
     det.unloading(lease)
     det.hold(700 * MIB)
@@ -161,9 +159,8 @@ def test_2_what_a_process_keeps_is_learnt() -> None:
     assert told["footprint"]["learnt_bytes"]["residue"] == 700 * MIB
 
 
-def test_2_stranded_bytes_have_an_owner() -> None:
+def test_2_stranded_bytes_have_an_owner(driver: CoreDriver) -> None:
     """Castwright#1976: 5.4 GB "stranded" were a resident model; what was missing was a name."""
-    driver = CoreDriver(8 * GIB)
     driver.device.names[BROWSER] = "ollama runner"
     driver.device.set(BROWSER, int(5.4 * GIB), driver.now)
     driver.advance(1.5)
@@ -213,9 +210,8 @@ def test_11_a_game_that_starts_is_charged_named_and_makes_idle_models_leave() ->
     assert driver.state(waiter) == "queued", "nothing is granted on top of it"
 
 
-def test_11_bytes_that_nobody_is_listed_for_are_reserve_too() -> None:
+def test_11_bytes_that_nobody_is_listed_for_are_reserve_too(driver: CoreDriver) -> None:
     """Where the driver lists no processes (LocalAI#7958 and others)."""
-    driver = CoreDriver(8 * GIB)
     driver.device.lists_processes = False
     driver.device.set(BROWSER, 3 * GIB, driver.now)
     driver.advance(1.5)
@@ -270,10 +266,9 @@ def test_13_a_reading_from_before_is_not_newer_because_it_arrives_later() -> Non
     assert first.driver.gpu()["measured_used_bytes"] == 5 * GIB
 
 
-def test_13_measured_free_memory_never_overrules_the_ledger() -> None:
+def test_13_measured_free_memory_never_overrules_the_ledger(driver: CoreDriver) -> None:
     """A lease that has not loaded yet holds nothing on the GPU, and all of its bytes in the
     ledger."""
-    driver = CoreDriver(8 * GIB)
     driver.consumer("a").acquire(6 * GIB, evictable=False)
     driver.advance(5.0)
     assert driver.gpu()["measured_used_bytes"] == 0
@@ -331,12 +326,11 @@ def test_20_what_the_machine_itself_takes_is_not_leased() -> None:
     assert (driver.state(fits), driver.state(waits)) == ("loading", "queued")
 
 
-def test_a_stowaway_that_goes_while_lists_are_hidden_is_not_taken_for_the_bytes_of_a_lease() -> (
-    None
-):
+def test_a_stowaway_that_goes_while_lists_are_hidden_is_not_taken_for_the_bytes_of_a_lease(
+    driver: CoreDriver,
+) -> None:
     """A storm of faults found it: the GPU fell by as much as was waited for, because a stowaway
     had died unseen, and an exclusive lease was granted beside bytes that were still there."""
-    driver = CoreDriver(8 * GIB)
     ghost = ProcessKey(9, 9)
     driver.device.set(ghost, 2 * GIB, driver.now)
     driver.advance(2.0)
@@ -356,12 +350,11 @@ def test_a_stowaway_that_goes_while_lists_are_hidden_is_not_taken_for_the_bytes_
     assert driver.device.shown(driver.now).get(job.process, 0) == 0
 
 
-def test_what_a_holder_freed_before_a_restart_is_waited_for_after_it() -> None:
+def test_what_a_holder_freed_before_a_restart_is_waited_for_after_it(driver: CoreDriver) -> None:
     """A storm of faults found it: the daemon was killed between an unload and its release. The
     driver listed the process with its context only, the total still had its model, and the next
     lease was granted beside it.
     """
-    driver = CoreDriver(8 * GIB)
     job, lease = held(driver, "job", 2, exclusive=True, residue_bytes=128 * MIB)
     token = job.token(lease)
     context = job.specs[lease].footprint.residue_bytes

@@ -52,10 +52,9 @@ def test_3_an_unload_that_hangs_holds_up_nobody_who_can_be_served_without_it(ask
 
 
 # -- 4: thrash and starvation
-def test_4_a_job_that_runs_is_finished_before_the_swap() -> None:
+def test_4_a_job_that_runs_is_finished_before_the_swap(driver: CoreDriver) -> None:
     """llama-swap#19, #611: the swap comes in the middle of the answer. Also a waiter of the highest
     priority waits for its end."""
-    driver = CoreDriver(8 * GIB)
     writer, lease = held(driver, "writer", 5, priority=10)
     writer.use_begin(lease, "answer")
     waiter = driver.consumer("w").acquire(5 * GIB, priority=100)
@@ -69,10 +68,9 @@ def test_4_a_job_that_runs_is_finished_before_the_swap() -> None:
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
 
 
-def test_4_whoever_waits_long_enough_is_next() -> None:
+def test_4_whoever_waits_long_enough_is_next(driver: CoreDriver) -> None:
     """llama-swap#784, ageing: "future" there. An endless stream of more important ones does not
     starve a background job."""
-    driver = CoreDriver(8 * GIB)
     people = {name: driver.consumer(name) for name in ("a", "b")}
     leases = {
         name: person.acquire(5 * GIB, priority=60, min_residency_s=0.0)
@@ -95,10 +93,9 @@ def test_4_whoever_waits_long_enough_is_next() -> None:
     )
 
 
-def test_4_six_that_fit_do_not_wait_for_one_that_idles() -> None:
+def test_4_six_that_fit_do_not_wait_for_one_that_idles(driver: CoreDriver) -> None:
     """aprender#3986: one lock for the whole GPU, held for 25 minutes at 97 % idle, six waiters.
     Bytes are leased, not the GPU."""
-    driver = CoreDriver(8 * GIB)
     _, idle = held(driver, "idle", 1)
     people = [driver.consumer(f"w{n}") for n in range(6)]
     waiters = [person.acquire(1 * GIB) for person in people]
@@ -108,10 +105,9 @@ def test_4_six_that_fit_do_not_wait_for_one_that_idles() -> None:
     assert [driver.state(lease) for lease in (idle, *waiters)] == ["held"] * 7
 
 
-def test_4_a_slow_stop_and_the_next_load_do_not_race() -> None:
+def test_4_a_slow_stop_and_the_next_load_do_not_race(driver: CoreDriver) -> None:
     """Ordo-AI-Stack PR#69: the stop takes 30 s, the load does not wait for it, both run out of
     memory and restart each other."""
-    driver = CoreDriver(8 * GIB)
     slow, lease = held(driver, "slow", 5)
     waiter = driver.consumer("w").acquire(5 * GIB)
     driver.until(lambda: driver.state(lease) == "revoking")
@@ -140,9 +136,8 @@ def test_6_what_fits_together_stays_together_without_groups() -> None:
     ]
 
 
-def test_6_of_equals_the_least_recently_used_leaves() -> None:
+def test_6_of_equals_the_least_recently_used_leaves(driver: CoreDriver) -> None:
     """llama-swap#1118."""
-    driver = CoreDriver(8 * GIB)
     people = {name: held(driver, name, 3.5) for name in ("older", "newer")}
     for name in ("newer", "older"):
         person, lease = people[name]
@@ -169,10 +164,9 @@ def test_7_what_is_measured_when_it_is_loaded_is_charged() -> None:
 
 
 # -- 8: two loads at once
-def test_8_memory_that_comes_back_during_a_load_confuses_neither() -> None:
+def test_8_memory_that_comes_back_during_a_load_confuses_neither(driver: CoreDriver) -> None:
     """vLLM#56830: asserts if free memory grows while it measures itself. A sibling gives its bytes
     back in the middle of a load."""
-    driver = CoreDriver(8 * GIB)
     driver.device.lag_s = 0.5
     leaver, going = held(driver, "leaver", 3)
     loader = driver.consumer("loader")
@@ -191,10 +185,9 @@ def test_8_memory_that_comes_back_during_a_load_confuses_neither() -> None:
 
 
 # -- 9: evicts a busy model
-def test_9_idle_is_what_its_holder_says_and_never_a_guess() -> None:
+def test_9_idle_is_what_its_holder_says_and_never_a_guess(driver: CoreDriver) -> None:
     """LLMKube#516: where the idle check gets no answer, it must not count as idle. Whoever uses and
     is silent is not unloaded for others."""
-    driver = CoreDriver(8 * GIB)
     silent, lease = held(driver, "silent", 5, ttl_s=3600.0)
     silent.use_begin(lease)
     waiter = driver.consumer("w").acquire(5 * GIB)
@@ -204,10 +197,9 @@ def test_9_idle_is_what_its_holder_says_and_never_a_guess() -> None:
 
 
 # -- 21: manual recipes
-def test_21_an_idle_model_stays_until_somebody_needs_its_room() -> None:
+def test_21_an_idle_model_stays_until_somebody_needs_its_room(driver: CoreDriver) -> None:
     """ServerlessLLM#306: lazy unload. No keep-alive to tune, no call to free the memory by hand
     (ComfyUI#3192, comfy-mcp#116)."""
-    driver = CoreDriver(8 * GIB)
     first, lease = held(driver, "first", 5, ttl_s=3600.0)
     driver.advance(3000.0)
     _, beside = held(driver, "beside", 2)
@@ -234,10 +226,9 @@ def test_21_a_detector_that_starts_again_at_once_waits_behind_the_policy(pause_s
 
 
 # -- 22: timeouts are guesses
-def test_22_a_load_may_take_as_long_as_it_takes() -> None:
+def test_22_a_load_may_take_as_long_as_it_takes(driver: CoreDriver) -> None:
     """ollama's load timeout, llama-swap's health check: a large model on a slow disk is killed at
     99 %. Whoever is heard of is left alone."""
-    driver = CoreDriver(8 * GIB)
     vlm = driver.consumer("vlm")
     lease = vlm.acquire(5 * GIB, ttl_s=10.0)
     waiter = driver.consumer("w").acquire(5 * GIB)
@@ -250,11 +241,10 @@ def test_22_a_load_may_take_as_long_as_it_takes() -> None:
     assert [note["consumer"] for note in driver.notes("ready")] == ["vlm"]
 
 
-def test_22_and_whoever_is_not_heard_of_is_given_up_within_its_ttl_however_short_its_load_was() -> (
-    None
-):
+def test_22_and_whoever_is_not_heard_of_is_given_up_within_its_ttl_however_short_its_load_was(
+    driver: CoreDriver,
+) -> None:
     """Silence is what is measured, not the length of the load."""
-    driver = CoreDriver(8 * GIB)
     hung = driver.consumer("hung")
     lease = hung.acquire(5 * GIB, ttl_s=10.0)
     hung.hold(1 * GIB)
@@ -264,9 +254,8 @@ def test_22_and_whoever_is_not_heard_of_is_given_up_within_its_ttl_however_short
     assert note["consumer"] == "hung"
 
 
-def test_22_a_load_without_progress_is_named_with_its_bytes() -> None:
+def test_22_a_load_without_progress_is_named_with_its_bytes(driver: CoreDriver) -> None:
     """LM Studio#831: people want to know that nothing moves any more, not that 120 s are over."""
-    driver = CoreDriver(8 * GIB)
     vlm = driver.consumer("vlm")
     lease = vlm.acquire(5 * GIB, ttl_s=3600.0)
     driver.consumer("w").acquire(5 * GIB)

@@ -52,10 +52,9 @@ LEAVES: dict[str, Callable[[CoreDriver, Consumer, LeaseId], object]] = {
 
 
 @pytest.mark.parametrize("how", LEAVES)
-def test_a_revoke_is_withdrawn_with_its_waiter(how: str) -> None:
+def test_a_revoke_is_withdrawn_with_its_waiter(driver: CoreDriver, how: str) -> None:
     """A holder in use stayed `revoking` for a waiter that was ended, unloaded at the end of its
     use, and the GPU stood empty with no waiter."""
-    driver = CoreDriver()
     holder, lease, waiter, wanted = revoked_in_use(driver)
     LEAVES[how](driver, waiter, wanted)
     assert driver.state(lease) == "held"
@@ -70,8 +69,7 @@ def test_a_revoke_is_withdrawn_with_its_waiter(how: str) -> None:
     assert not driver.notes("reminded")
 
 
-def test_a_revoke_is_withdrawn_where_the_wait_times_out() -> None:
-    driver = CoreDriver()
+def test_a_revoke_is_withdrawn_where_the_wait_times_out(driver: CoreDriver) -> None:
     holder, lease = held(driver, "train", 5)
     holder.use_begin(lease)
     driver.consumer("hasty").acquire(5 * GIB, wait_timeout_s=3.0)
@@ -100,8 +98,7 @@ def test_a_revoke_is_withdrawn_where_other_room_came_first() -> None:
     assert not granted["evicted"]
 
 
-def test_an_unload_that_has_begun_completes() -> None:
-    driver = CoreDriver()
+def test_an_unload_that_has_begun_completes(driver: CoreDriver) -> None:
     holder, lease, waiter, wanted = revoked_in_use(driver)
     holder.use_end(lease)
     holder.unloading(lease)
@@ -112,10 +109,9 @@ def test_an_unload_that_has_begun_completes() -> None:
     driver.until(lambda: driver.state(lease) == "over")
 
 
-def test_another_waiter_takes_the_eviction_over() -> None:
+def test_another_waiter_takes_the_eviction_over(driver: CoreDriver) -> None:
     """No withdrawal and no second acknowledgement: the holder is asked on, for the next in the
     queue, and its eviction is that one's."""
-    driver = CoreDriver()
     holder, lease, waiter, wanted = revoked_in_use(driver)
     later = driver.consumer("later")
     next_one = later.acquire(5 * GIB)
@@ -133,8 +129,7 @@ def test_another_waiter_takes_the_eviction_over() -> None:
     assert granted["evicted"] == ["train"]
 
 
-def test_only_what_another_waiter_needs_stays_revoked() -> None:
-    driver = CoreDriver()
+def test_only_what_another_waiter_needs_stays_revoked(driver: CoreDriver) -> None:
     one, first = held(driver, "one", 3)
     two, second = held(driver, "two", 4)
     one.use_begin(first)
@@ -155,8 +150,7 @@ def test_only_what_another_waiter_needs_stays_revoked() -> None:
     driver.until(lambda: driver.state(little) == "loading")
 
 
-def test_an_operators_order_stands() -> None:
-    driver = CoreDriver()
+def test_an_operators_order_stands(driver: CoreDriver) -> None:
     holder, lease, waiter, wanted = revoked_in_use(driver)
     evict(driver, lease)
     waiter.cancel(wanted)
@@ -167,8 +161,7 @@ def test_an_operators_order_stands() -> None:
     driver.until(lambda: driver.state(lease) == "over")
 
 
-def test_a_revoke_for_pressure_ends_with_the_pressure() -> None:
-    driver = CoreDriver()
+def test_a_revoke_for_pressure_ends_with_the_pressure(driver: CoreDriver) -> None:
     _, lease = held(driver, "train", 5)
     stranger = driver.consumer("stranger")
     stranger.leave()
@@ -195,10 +188,9 @@ def test_a_release_that_crosses_the_withdrawal_is_that_of_an_eviction() -> None:
     assert parked["comes_back"]
 
 
-def test_a_release_long_after_the_withdrawal_is_the_holders_own() -> None:
+def test_a_release_long_after_the_withdrawal_is_the_holders_own(driver: CoreDriver) -> None:
     """A holder that used its lease since has heard that it may stay. What it releases then is not
     granted again by itself: a holder without a client library of ours does not expect that."""
-    driver = CoreDriver()
     holder, lease, waiter, wanted = revoked_in_use(driver, standby=True)
     waiter.cancel(wanted)
     holder.use_end(lease)
@@ -224,10 +216,9 @@ def test_a_withdrawn_holder_keeps_its_place_among_residents() -> None:
     assert ready == sorted(ready)
 
 
-def test_a_grant_names_only_evictions_that_were_asked_for_it() -> None:
+def test_a_grant_names_only_evictions_that_were_asked_for_it(driver: CoreDriver) -> None:
     """134 s after an eviction for a waiter that had gone, a grant on the empty GPU said «fits after
     train left» and a switch of 762 s."""
-    driver = CoreDriver()
     holder, lease, waiter, wanted = revoked_in_use(driver)
     holder.use_end(lease)
     holder.unloading(lease)
@@ -259,8 +250,7 @@ def test_a_waiter_that_leaves_before_its_grant_leaves_no_eviction_behind() -> No
     assert not gpu.evictions
 
 
-def test_an_operators_eviction_makes_no_switch() -> None:
-    driver = CoreDriver()
+def test_an_operators_eviction_makes_no_switch(driver: CoreDriver) -> None:
     holder, lease = held(driver, "train", 5)
     evict(driver, lease)
     holder.unload(lease)
@@ -300,9 +290,8 @@ def drain(driver: CoreDriver) -> None:
     ops.order("drain")
 
 
-def test_on_a_gpu_that_grants_nothing_a_revoke_is_withdrawn_too() -> None:
+def test_on_a_gpu_that_grants_nothing_a_revoke_is_withdrawn_too(driver: CoreDriver) -> None:
     """A drain lasts as long as its operator wants."""
-    driver = CoreDriver()
     _, lease, waiter, wanted = revoked_in_use(driver)
     small = driver.consumer("small").acquire(GIB)
     assert driver.state(small) == "loading", "backfilled"
@@ -311,9 +300,8 @@ def test_on_a_gpu_that_grants_nothing_a_revoke_is_withdrawn_too() -> None:
     assert driver.state(lease) == "held"
 
 
-def test_on_a_gpu_that_grants_nothing_the_next_waiter_takes_over() -> None:
+def test_on_a_gpu_that_grants_nothing_the_next_waiter_takes_over(driver: CoreDriver) -> None:
     """It kept the name of the waiter that was gone."""
-    driver = CoreDriver()
     _, lease, waiter, wanted = revoked_in_use(driver)
     driver.consumer("later").acquire(5 * GIB)
     drain(driver)

@@ -329,11 +329,11 @@ def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
 
 @pytest.mark.parametrize("restarts", [1, 2])
 def test_who_is_given_up_and_keeps_its_bytes_has_its_lease_until_it_fences_itself(
+    driver: CoreDriver,
     restarts: int,
 ) -> None:
     """A frozen process wakes up and goes on for as long as it believes in its lease; what it keeps
     until then is no mere residue."""
-    driver = CoreDriver(8 * GIB)
     ops = driver.consumer("ops")
     det, lease = held_bytes(driver, "det", 5 * GIB, ttl_s=30.0)
     driver.restart()

@@ -14,8 +14,7 @@ from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
 GIB = d.GIB
 
 
-def test_a_first_client_makes_the_gpu_be_read_if_the_reading_is_old() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_first_client_makes_the_gpu_be_read_if_the_reading_is_old(driver: CoreDriver) -> None:
     driver.advance(60.0)
     assert driver.arbiter.next_deadline() is None, "nobody is interested: the GPU is left alone"
     det = driver.consumer("det")
@@ -24,8 +23,7 @@ def test_a_first_client_makes_the_gpu_be_read_if_the_reading_is_old() -> None:
     assert det.connect() == []
 
 
-def test_bye_gives_everything_back() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_bye_gives_everything_back(driver: CoreDriver) -> None:
     det, runner = driver.consumer("det"), driver.consumer("runner")
     held = det.acquire(2 * GIB)
     det.load(held)
@@ -68,8 +66,7 @@ def test_a_use_that_was_repeated_on_a_new_connection_outlives_the_old_one() -> N
     assert driver.notes("use_ended")
 
 
-def test_pushes_go_to_another_living_connection_of_the_process() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_pushes_go_to_another_living_connection_of_the_process(driver: CoreDriver) -> None:
     first = driver.consumer("det", pid=500)
     held = first.acquire(5 * GIB)
     first.load(held)
@@ -113,8 +110,7 @@ def test_a_death_ends_leases_waits_and_uses_and_its_bytes_are_measured_away() ->
     )
 
 
-def test_a_death_during_verification_needs_no_residue_any_more() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_death_during_verification_needs_no_residue_any_more(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     held = det.acquire(5 * GIB, residue_bytes=1 * GIB)
     det.load(held)
@@ -125,8 +121,7 @@ def test_a_death_during_verification_needs_no_residue_any_more() -> None:
     assert driver.journal == {}
 
 
-def test_the_residue_of_a_dead_process_is_measured_away_too() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_the_residue_of_a_dead_process_is_measured_away_too(driver: CoreDriver) -> None:
     det, big = driver.consumer("det"), driver.consumer("big")
     held = det.acquire(5 * GIB, residue_bytes=1 * GIB)
     det.load(held)
@@ -143,8 +138,7 @@ def test_the_residue_of_a_dead_process_is_measured_away_too() -> None:
     assert driver.notes("verified")[-1]["lease_id"] is None
 
 
-def test_a_grant_that_cannot_be_written_is_taken_back() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_grant_that_cannot_be_written_is_taken_back(driver: CoreDriver) -> None:
     det, vlm = driver.consumer("det"), driver.consumer("vlm")
     held = det.acquire(5 * GIB)
     waiting = vlm.acquire(5 * GIB)
@@ -159,9 +153,8 @@ def test_a_grant_that_cannot_be_written_is_taken_back() -> None:
     assert driver.gpu()["charged_bytes"] == 0, "nothing stays charged for it"
 
 
-def test_a_grant_taken_back_leaves_the_residue_of_its_process_charged() -> None:
+def test_a_grant_taken_back_leaves_the_residue_of_its_process_charged(driver: CoreDriver) -> None:
     """Regression: with the grant the ledger forgot the context that the process had all along."""
-    driver = CoreDriver(8 * GIB)
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB, residue_bytes=1 * GIB)
     det.load(lease)
@@ -177,8 +170,7 @@ def test_a_grant_taken_back_leaves_the_residue_of_its_process_charged() -> None:
     assert driver.gpu()["charged_bytes"] == 1 * GIB
 
 
-def test_a_grant_in_reply_that_cannot_be_written_is_refused_once() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_grant_in_reply_that_cannot_be_written_is_refused_once(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     driver.journal_failing = "disk full"
     det.try_acquire(5 * GIB)
@@ -189,8 +181,7 @@ def test_a_grant_in_reply_that_cannot_be_written_is_refused_once() -> None:
     assert notes[-2:] == ["journal_failed", "denied"]
 
 
-def test_other_records_that_fail_are_noted_and_nothing_else() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_other_records_that_fail_are_noted_and_nothing_else(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     held = det.acquire(5 * GIB)
     driver.journal_failing = "disk full"
@@ -200,10 +191,9 @@ def test_other_records_that_fail_are_noted_and_nothing_else() -> None:
     assert [type(effect) for effect in effects] == [Note]
 
 
-def test_a_loading_holder_is_not_undone_by_a_later_record() -> None:
+def test_a_loading_holder_is_not_undone_by_a_later_record(driver: CoreDriver) -> None:
     """Regression: a pin that a full disk did not take withdrew the lease of a holder that was
     loading, and its bytes were given away."""
-    driver = CoreDriver(8 * GIB)
     det, ops = driver.consumer("det"), driver.consumer("ops")
     loading = det.acquire(5 * GIB)
     driver.journal_failing = "disk full"
@@ -214,8 +204,7 @@ def test_a_loading_holder_is_not_undone_by_a_later_record() -> None:
     assert not driver.pushes("denied")
 
 
-def test_a_release_is_told_though_its_record_fails() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_release_is_told_though_its_record_fails(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     held = det.acquire(5 * GIB)
     det.load(held)
@@ -225,8 +214,7 @@ def test_a_release_is_told_though_its_record_fails() -> None:
     assert driver.notes("released")
 
 
-def test_strangers_to_the_core_die_unmourned() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_strangers_to_the_core_die_unmourned(driver: CoreDriver) -> None:
     assert driver.post(ProcessDied(ProcessKey(1, 1))) == []
     assert driver.post(ClientLeft(ClientId("x"), "bye")) == []
     assert driver.state(LeaseId("L1-1")) == "over"
@@ -280,8 +268,7 @@ def test_an_instance_that_reconnects_is_one_client_with_everything_that_was_its_
     )
 
 
-def test_a_connection_that_says_hello_as_another_instance_is_only_that() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_connection_that_says_hello_as_another_instance_is_only_that(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     driver.post(ClientConnected(det.client, det.process, 1000, "det", "second"))
     back = ClientId("back")

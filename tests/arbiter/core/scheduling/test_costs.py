@@ -79,8 +79,7 @@ def stay(driver: CoreDriver, person: Consumer) -> LeaseId:
     return lease
 
 
-def test_who_never_comes_back_is_cheaper_to_send_away() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_who_never_comes_back_is_cheaper_to_send_away(driver: CoreDriver) -> None:
     rare, regular = driver.consumer("rare"), driver.consumer("regular")
     for _ in range(4):
         come_and_go(driver, rare, 100.0)

@@ -15,8 +15,7 @@ STRANGER = ProcessKey(9, 9)
 
 
 # -- order and backfill
-def test_a_higher_priority_passes_and_equals_keep_their_order() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_higher_priority_passes_and_equals_keep_their_order(driver: CoreDriver) -> None:
     det, lease = driver.consumer("det"), LeaseId("")
     lease = det.acquire(6 * GIB)
     low = driver.consumer("low").acquire(6 * GIB)
@@ -27,8 +26,7 @@ def test_a_higher_priority_passes_and_equals_keep_their_order() -> None:
     assert driver.state(low) == "queued"
 
 
-def test_a_small_one_passes_the_head_if_it_cannot_delay_it() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_small_one_passes_the_head_if_it_cannot_delay_it(driver: CoreDriver) -> None:
     busy, busy_lease = held(driver, "busy", 4)
     busy.use_begin(busy_lease)
     head = driver.consumer("head").acquire(5 * GIB)
@@ -77,8 +75,7 @@ def test_while_the_head_s_victim_unloads_nobody_starts_a_load_in_between() -> No
     driver.until(lambda: driver.state(head) == "loading")
 
 
-def test_an_exclusive_waiter_never_passes() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_an_exclusive_waiter_never_passes(driver: CoreDriver) -> None:
     busy, busy_lease = held(driver, "busy", 4, priority=90)
     busy.use_begin(busy_lease)
     head = driver.consumer("head").acquire(5 * GIB)
@@ -110,8 +107,7 @@ def test_the_debt_of_an_exclusive_holder_keeps_the_gpu_to_itself(end: str) -> No
     assert not driver.device.shown(driver.now)
 
 
-def test_residues_may_stay_beside_an_exclusive_lease() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_residues_may_stay_beside_an_exclusive_lease(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
     det.unload(lease)
     driver.until(lambda: driver.state(lease) == "over")
@@ -137,10 +133,9 @@ def test_an_old_reading_carries_no_grant_a_fresh_one_is_asked_for() -> None:
     ]
 
 
-def test_the_gpu_may_say_no_where_the_ledger_says_yes() -> None:
+def test_the_gpu_may_say_no_where_the_ledger_says_yes(driver: CoreDriver) -> None:
     """Total-only backend: bytes that appear while somebody loads cannot be explained, but they are
     not free either."""
-    driver = CoreDriver(8 * GIB)
     driver.device.lists_processes = False
     det, lease = held(driver, "det", 1)
     driver.device.set(STRANGER, 4 * GIB, driver.now)
@@ -203,8 +198,7 @@ def test_an_exclusive_lease_that_expired_keeps_others_out_until_it_is_measured_g
 
 
 # -- pressure
-def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder(driver: CoreDriver) -> None:
     calm, calm_lease = held(driver, "calm", 2)
     _, other_lease = held(driver, "other", 4)
     busy, busy_lease = held(driver, "busy", 1)
@@ -228,8 +222,7 @@ def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder() -> None:
     assert driver.notes("pressure")[-1]["pressure_bytes"] == 0
 
 
-def test_pressure_that_cannot_be_covered_asks_every_idle_holder() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_pressure_that_cannot_be_covered_asks_every_idle_holder(driver: CoreDriver) -> None:
     _, small = held(driver, "small", 1)
     busy, busy_lease = held(driver, "busy", 6)
     busy.use_begin(busy_lease)
@@ -239,8 +232,7 @@ def test_pressure_that_cannot_be_covered_asks_every_idle_holder() -> None:
     driver.device.total_bytes = 16 * GIB
 
 
-def test_a_holder_above_its_charge_is_pressure_not_a_stowaway() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_holder_above_its_charge_is_pressure_not_a_stowaway(driver: CoreDriver) -> None:
     liar, lease = held(driver, "liar", 3)
     liar.use_begin(lease)
     _, idle = held(driver, "idle", 4, min_residency_s=5.0)
@@ -253,8 +245,7 @@ def test_a_holder_above_its_charge_is_pressure_not_a_stowaway() -> None:
     driver.until(lambda: driver.state(idle) == "revoking", limit_s=6.0)
 
 
-def test_ready_with_more_than_granted_is_pressure_and_no_violation() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_ready_with_more_than_granted_is_pressure_and_no_violation(driver: CoreDriver) -> None:
     a, first = held(driver, "a", 4)
     a.use_begin(first)
     b = driver.consumer("b")
@@ -320,8 +311,7 @@ def test_the_dearer_gpu_is_emptied_if_the_cheaper_one_is_not_its_turn() -> None:
     assert driver.state(waiter) == "queued"
 
 
-def test_readings_of_unknown_gpus_and_late_ones_are_dropped() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_readings_of_unknown_gpus_and_late_ones_are_dropped(driver: CoreDriver) -> None:
     assert driver.post(MemorySampled(GpuId("GPU-9"), driver.now, 0, 1, None)) == []
     driver.post(MemorySampled(GpuId("GPU-0"), driver.now, 123, 8 * GIB, ()))
     driver.post(MemorySampled(GpuId("GPU-0"), driver.now - 5.0, 456, 8 * GIB, ()))

@@ -16,6 +16,11 @@ GIB = d.GIB
 ZERO, ONE = GpuId("GPU-0"), GpuId("GPU-1")
 
 
+@pytest.fixture
+def driver() -> CoreDriver:
+    return CoreDriver(8 * GIB, gpus=2)
+
+
 # -- selector and placement
 @pytest.mark.parametrize(
     ("selector", "wanted"), [("1", ONE), ("GPU-1", ONE), ("0", ZERO), ("any", ZERO)]
@@ -29,15 +34,13 @@ def test_a_selector_is_an_uuid_an_index_or_any(selector: str, wanted: GpuId) -> 
     ]
 
 
-def test_an_unknown_gpu_is_named_with_those_that_are_there() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_an_unknown_gpu_is_named_with_those_that_are_there(driver: CoreDriver) -> None:
     refused = refusal(driver.consumer("a").try_acquire(1 * GIB, gpu="GPU-7"))
     assert (refused.code, refused.details["known"]) == ("unknown_gpu", [ZERO, ONE])
 
 
-def test_a_lease_is_never_split() -> None:
+def test_a_lease_is_never_split(driver: CoreDriver) -> None:
     """12 GiB are free on two GPUs, 7 on each is all that one lease can ever have."""
-    driver = CoreDriver(8 * GIB, gpus=2)
     assert refusal(driver.consumer("a").try_acquire(9 * GIB)).code == "vram_insufficient"
     _, lease = held(driver, "b", 7)
     assert sum(1 for n in (0, 1) if driver.gpu(n)["charged_bytes"]) == 1
@@ -45,8 +48,7 @@ def test_a_lease_is_never_split() -> None:
     assert {place(driver, lease), place(driver, other)} == {ZERO, ONE}
 
 
-def test_a_model_over_two_gpus_is_two_leases_of_one_process() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_a_model_over_two_gpus_is_two_leases_of_one_process(driver: CoreDriver) -> None:
     big = driver.consumer("big")
     halves = [
         big.acquire(6 * GIB, gpu=str(n), key=f"half {n}", residue_bytes=GIB // 2) for n in (0, 1)
@@ -68,24 +70,21 @@ def test_a_model_over_two_gpus_is_two_leases_of_one_process() -> None:
     )
 
 
-def test_pins_are_in_the_way_on_their_own_gpu_only() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_pins_are_in_the_way_on_their_own_gpu_only(driver: CoreDriver) -> None:
     held(driver, "pinned", 5, gpu="0", evictable=False)
     waiter = driver.consumer("a").acquire(5 * GIB, gpu="0")
     _, lease = held(driver, "b", 5)
     assert (place(driver, lease), driver.state(waiter)) == (ONE, "queued")
 
 
-def test_exclusive_means_alone_on_its_gpu() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_exclusive_means_alone_on_its_gpu(driver: CoreDriver) -> None:
     _, alone = held(driver, "alone", 2, exclusive=True, evictable=False)
     _, other = held(driver, "other", 2)
     assert (place(driver, alone), place(driver, other)) == (ZERO, ONE)
 
 
 # -- queues
-def test_a_waiter_for_one_gpu_does_not_hold_up_another() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_a_waiter_for_one_gpu_does_not_hold_up_another(driver: CoreDriver) -> None:
     busy, lease = held(driver, "busy", 6, gpu="0")
     busy.use_begin(lease)
     waits = driver.consumer("w").acquire(6 * GIB, gpu="0", priority=90)
@@ -144,10 +143,9 @@ def test_the_head_that_is_placed_elsewhere_does_not_keep_a_gpu_from_the_next() -
     assert place(driver, placed) == ONE, "whoever it is, the free GPU is used at once"
 
 
-def test_what_fits_beside_the_head_that_is_placed_elsewhere_is_granted() -> None:
+def test_what_fits_beside_the_head_that_is_placed_elsewhere_is_granted(driver: CoreDriver) -> None:
     """It is the head here: no backfill has to let it pass, and nothing is spared for a waiter that
     comes to another GPU."""
-    driver = CoreDriver(8 * GIB, gpus=2)
     first, a = held(driver, "a", 6, gpu="0", priority=10)
     second, b = held(driver, "b", 4, gpu="1", priority=90)
     first.use_begin(a)
@@ -159,8 +157,7 @@ def test_what_fits_beside_the_head_that_is_placed_elsewhere_is_granted() -> None
     assert (place(driver, other), driver.state(head)) == (ONE, "queued")
 
 
-def test_two_heads_that_are_placed_elsewhere_leave_the_gpu_to_nobody() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_two_heads_that_are_placed_elsewhere_leave_the_gpu_to_nobody(driver: CoreDriver) -> None:
     first, a = held(driver, "a", 3, gpu="0", priority=10)
     second, b = held(driver, "b", 3, gpu="0", priority=10)
     third, c = held(driver, "c", 6, gpu="1", priority=90)
@@ -177,9 +174,8 @@ def test_two_heads_that_are_placed_elsewhere_leave_the_gpu_to_nobody() -> None:
     driver.until(lambda: driver.state(waiting[0]) == "loading", limit_s=2.0)
 
 
-def test_a_holder_that_outstays_on_one_gpu_frees_its_waiter_for_another() -> None:
+def test_a_holder_that_outstays_on_one_gpu_frees_its_waiter_for_another(driver: CoreDriver) -> None:
     """Regression: once somebody was asked on GPU 0, no other GPU was ever considered."""
-    driver = CoreDriver(8 * GIB, gpus=2)
     stuck, a = held(driver, "stuck", 6, gpu="0", priority=10)
     later, b = held(driver, "later", 6, gpu="1", priority=20, min_residency_s=5.0)
     stuck.use_begin(a)
@@ -195,10 +191,9 @@ def test_a_holder_that_outstays_on_one_gpu_frees_its_waiter_for_another() -> Non
     assert place(driver, waiter) == ONE
 
 
-def test_a_leave_that_was_not_enough_frees_its_waiter_for_another_gpu() -> None:
+def test_a_leave_that_was_not_enough_frees_its_waiter_for_another_gpu(driver: CoreDriver) -> None:
     """The bytes of the victim stay on GPU 0 as a residue that nobody expected: GPU 1 is emptied
     then."""
-    driver = CoreDriver(8 * GIB, gpus=2)
     leaky, a = held(driver, "leaky", 6, gpu="0", priority=10)
     _, b = held(driver, "b", 6, gpu="1", priority=20)
     waiter = driver.consumer("w").acquire(6 * GIB)
@@ -210,9 +205,8 @@ def test_a_leave_that_was_not_enough_frees_its_waiter_for_another_gpu() -> None:
 
 
 # -- at once, and without asking
-def test_what_fits_on_the_other_gpu_goes_there_and_nobody_is_asked() -> None:
+def test_what_fits_on_the_other_gpu_goes_there_and_nobody_is_asked(driver: CoreDriver) -> None:
     """The first GPU could be emptied, its holder is idle; the second is free."""
-    driver = CoreDriver(8 * GIB, gpus=2)
     _, idle = held(driver, "idle", 6, gpu="0", priority=1)
     lease = driver.consumer("w").acquire(6 * GIB)
     assert (driver.state(lease), place(driver, lease)) == ("loading", ONE)
@@ -220,10 +214,9 @@ def test_what_fits_on_the_other_gpu_goes_there_and_nobody_is_asked() -> None:
     assert not driver.notes("revoke_asked")
 
 
-def test_while_somebody_loads_where_it_fits_nobody_is_asked_elsewhere() -> None:
+def test_while_somebody_loads_where_it_fits_nobody_is_asked_elsewhere(driver: CoreDriver) -> None:
     """Regression: the idle holder of the first GPU was thrown out for the seconds that a load on
     the second took."""
-    driver = CoreDriver(8 * GIB, gpus=2)
     _, idle = held(driver, "idle", 6, gpu="0")
     loads = driver.consumer("loads")
     loading = loads.acquire(1 * GIB, gpu="1")
@@ -236,8 +229,7 @@ def test_while_somebody_loads_where_it_fits_nobody_is_asked_elsewhere() -> None:
     assert not driver.notes("revoke_asked")
 
 
-def test_a_load_without_end_is_not_waited_for_for_ever() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_a_load_without_end_is_not_waited_for_for_ever(driver: CoreDriver) -> None:
     holder, idle = held(driver, "idle", 6, gpu="0")
     stuck = driver.consumer("stuck").acquire(1 * GIB, gpu="1")
     lease = driver.consumer("w").acquire(6 * GIB)
@@ -248,8 +240,7 @@ def test_a_load_without_end_is_not_waited_for_for_ever() -> None:
     assert (place(driver, lease), driver.state(stuck)) == (ZERO, "loading")
 
 
-def test_one_that_names_its_gpu_waits_for_it_beside_an_empty_one() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_one_that_names_its_gpu_waits_for_it_beside_an_empty_one(driver: CoreDriver) -> None:
     busy, lease = held(driver, "busy", 6, gpu="1", priority=90)
     busy.use_begin(lease)
     waiter = driver.consumer("w").acquire(6 * GIB, gpu="GPU-1")
@@ -263,8 +254,7 @@ def test_one_that_names_its_gpu_waits_for_it_beside_an_empty_one() -> None:
 
 
 # -- order and ageing
-def test_whoever_came_first_is_first_on_every_gpu() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_whoever_came_first_is_first_on_every_gpu(driver: CoreDriver) -> None:
     people = [held(driver, f"busy{n}", 6, gpu=str(n), priority=90) for n in (0, 1)]
     for person, lease in people:
         person.use_begin(lease)
@@ -285,10 +275,9 @@ def test_whoever_came_first_is_first_on_every_gpu() -> None:
     )
 
 
-def test_a_waiter_for_any_gpu_ages_on_all_of_them() -> None:
+def test_a_waiter_for_any_gpu_ages_on_all_of_them(driver: CoreDriver) -> None:
     """Both holders are in use and above it; it is let to ask the lower one first, when it has aged
     to that."""
-    driver = CoreDriver(8 * GIB, gpus=2)
     leases = []
     for index, priority in ((0, 56), (1, 54)):
         person, lease = held(driver, f"busy{index}", 6, gpu=str(index), priority=priority)
@@ -341,9 +330,8 @@ def on_standby(driver: CoreDriver, selector: str) -> tuple[Consumer, LeaseId]:
 
 @pytest.mark.parametrize(("selector", "wanted"), [("any", ONE), ("0", None), ("GPU-0", None)])
 def test_standby_returns_to_the_gpus_that_its_selector_names(
-    selector: str, wanted: GpuId | None
+    driver: CoreDriver, selector: str, wanted: GpuId | None
 ) -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
     det, lease = on_standby(driver, selector)
     driver.advance(10.0)
     assert place(driver, lease) == wanted
@@ -358,16 +346,14 @@ def test_standby_returns_to_the_gpus_that_its_selector_names(
     assert driver.state(lease) == "held"
 
 
-def test_a_waiter_for_one_gpu_keeps_nobody_from_returning_to_another() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_a_waiter_for_one_gpu_keeps_nobody_from_returning_to_another(driver: CoreDriver) -> None:
     _, lease = on_standby(driver, "any")
     waiter = driver.consumer("w").acquire(5 * GIB, gpu="0", priority=10)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
     assert (place(driver, lease), driver.state(waiter)) == (ONE, "queued")
 
 
-def test_standby_does_not_return_to_a_gpu_that_cannot_be_read() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_standby_does_not_return_to_a_gpu_that_cannot_be_read(driver: CoreDriver) -> None:
     filler, fills = held(driver, "filler", 6, gpu="1", evictable=False)
     det, lease = held(driver, "det", 5, standby=True)
     policy = driver.consumer("policy")
@@ -385,8 +371,7 @@ def test_standby_does_not_return_to_a_gpu_that_cannot_be_read() -> None:
 
 
 # -- GPUs that fail, drains
-def test_a_gpu_that_cannot_be_read_blocks_itself_only() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_a_gpu_that_cannot_be_read_blocks_itself_only(driver: CoreDriver) -> None:
     driver.devices[ZERO].failing = "NVML_ERROR_GPU_IS_LOST"
     driver.advance(1.5)
     anywhere = driver.consumer("a").acquire(5 * GIB)
@@ -399,8 +384,7 @@ def test_a_gpu_that_cannot_be_read_blocks_itself_only() -> None:
     driver.until(lambda: driver.state(there) == "loading", limit_s=2.0)
 
 
-def test_a_gpu_whose_reading_hangs_blocks_itself_only() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_a_gpu_whose_reading_hangs_blocks_itself_only(driver: CoreDriver) -> None:
     driver.devices[ONE].silent = True
     driver.advance(5.0)
     there = driver.consumer("there").acquire(5 * GIB, gpu="1")
@@ -413,10 +397,9 @@ def test_a_gpu_whose_reading_hangs_blocks_itself_only() -> None:
     )
 
 
-def test_a_gpu_that_is_lost_keeps_its_leases_and_the_others_go_on() -> None:
+def test_a_gpu_that_is_lost_keeps_its_leases_and_the_others_go_on(driver: CoreDriver) -> None:
     """Unplugged in the middle: what was held there stays charged there, and whoever may go
     elsewhere does."""
-    driver = CoreDriver(8 * GIB, gpus=2)
     _, b = held(driver, "b", 5, gpu="1")
     a, freed = held(driver, "a", 5, gpu="0")
     driver.devices[ONE].failing = "NVML_ERROR_GPU_IS_LOST"
@@ -431,8 +414,7 @@ def test_a_gpu_that_is_lost_keeps_its_leases_and_the_others_go_on() -> None:
     assert driver.gpu(1)["charged_bytes"] == 5 * GIB
 
 
-def test_pressure_on_one_gpu_asks_nobody_on_another() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_pressure_on_one_gpu_asks_nobody_on_another(driver: CoreDriver) -> None:
     _, a = held(driver, "a", 6, gpu="0")
     _, b = held(driver, "b", 6, gpu="1")
     driver.devices[ZERO].set(driver.consumer("game").process, 4 * GIB, driver.now)
@@ -440,9 +422,8 @@ def test_pressure_on_one_gpu_asks_nobody_on_another() -> None:
     assert driver.state(b) == "held"
 
 
-def test_verifications_are_per_gpu() -> None:
+def test_verifications_are_per_gpu(driver: CoreDriver) -> None:
     """The bytes that one GPU gets back do not prove that another did."""
-    driver = CoreDriver(8 * GIB, gpus=2)
     big = driver.consumer("big")
     halves = [big.acquire(6 * GIB, gpu=str(n), key=f"half {n}") for n in (0, 1)]
     for half in halves:
@@ -458,8 +439,7 @@ def test_verifications_are_per_gpu() -> None:
 
 
 # -- restarts
-def test_a_restart_keeps_every_lease_on_its_gpu() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
+def test_a_restart_keeps_every_lease_on_its_gpu(driver: CoreDriver) -> None:
     people = [held(driver, f"p{n}", 5, gpu=str(n)) for n in (0, 1)]
     tokens = [person.token(lease) for person, lease in people]
     driver.restart()

@@ -69,10 +69,9 @@ def test_what_the_head_will_need_is_kept_for_it() -> None:
     driver.until(lambda: driver.state(head) == "loading", limit_s=1.0)
 
 
-def test_a_head_that_could_be_served_by_leaves_alone_keeps_its_room() -> None:
+def test_a_head_that_could_be_served_by_leaves_alone_keeps_its_room(driver: CoreDriver) -> None:
     """It fits beside the stowaway once the holder has gone: what comes back of the stowaway is not
     counted on."""
-    driver = CoreDriver(8 * GIB)
     busy, lease = held_after_peak(driver, "busy", 4, priority=90)
     busy.use_begin(lease)
     stowaway(driver, 2)
@@ -97,8 +96,7 @@ def test_one_that_can_never_be_asked_to_leave_does_not_pass() -> None:
     assert driver.state(other) == "held", "those behind it pass both"
 
 
-def test_nobody_passes_an_exclusive_head_that_waits_for_a_stowaway() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_nobody_passes_an_exclusive_head_that_waits_for_a_stowaway(driver: CoreDriver) -> None:
     stowaway(driver, 4)
     head = driver.consumer("head").acquire(5 * GIB, exclusive=True)
     small = driver.consumer("small").acquire(1 * GIB)
@@ -181,9 +179,8 @@ def test_whoever_passed_is_in_nobodys_way_when_the_stowaway_is_gone(seed: int) -
 
 
 # -- residues
-def test_small_ones_pass_a_head_that_waits_for_a_context() -> None:
+def test_small_ones_pass_a_head_that_waits_for_a_context(driver: CoreDriver) -> None:
     """7.4 GiB do not fit beside the context of a process that lives on; when it ends, both do."""
-    driver = CoreDriver(8 * GIB)
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
     old.unload(lease)
     driver.until(lambda: driver.state(lease) == "over")
@@ -195,8 +192,7 @@ def test_small_ones_pass_a_head_that_waits_for_a_context() -> None:
     driver.until(lambda: driver.state(head) == "loading", limit_s=2.0)
 
 
-def test_while_a_dead_process_s_context_is_measured_nobody_passes() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_while_a_dead_process_s_context_is_measured_nobody_passes(driver: CoreDriver) -> None:
     driver.device.lag_s = 1.0
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
     old.unload(lease)
@@ -222,10 +218,9 @@ def learned(driver: CoreDriver, gib: float) -> Consumer:
     return driver.consumer("greedy")
 
 
-def test_what_was_learned_never_waits_for_bytes_that_may_stay_for_good() -> None:
+def test_what_was_learned_never_waits_for_bytes_that_may_stay_for_good(driver: CoreDriver) -> None:
     """Regression: a request of 3 GiB of which 7.4 were learned waited for the context of a live
     process, and the request of that very process waited behind it: neither was ever granted."""
-    driver = CoreDriver(8 * GIB)
     greedy = learned(driver, 7.4)
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
     old.unload(lease)
@@ -238,9 +233,8 @@ def test_what_was_learned_never_waits_for_bytes_that_may_stay_for_good() -> None
     driver.until(lambda: driver.state(behind) == "loading", limit_s=2.0)
 
 
-def test_what_holders_will_give_back_is_waited_for_at_the_learned_bytes() -> None:
+def test_what_holders_will_give_back_is_waited_for_at_the_learned_bytes(driver: CoreDriver) -> None:
     """A pinned holder ends one day: until then the request keeps what was learned of it."""
-    driver = CoreDriver(8 * GIB)
     greedy = learned(driver, 6)
     old, lease = held_after_peak(driver, "old", 4, evictable=False)
     head = greedy.acquire(3 * GIB)
@@ -251,8 +245,7 @@ def test_what_holders_will_give_back_is_waited_for_at_the_learned_bytes() -> Non
     assert driver.gpu()["charged_bytes"] == 6 * GIB
 
 
-def test_nothing_is_settled_below_the_declaration() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_nothing_is_settled_below_the_declaration(driver: CoreDriver) -> None:
     greedy = learned(driver, 7.4)
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
     old.unload(lease)
@@ -265,10 +258,9 @@ def test_nothing_is_settled_below_the_declaration() -> None:
 
 
 # -- whose bytes
-def test_bytes_that_the_head_s_own_process_holds_already_do_not_leave() -> None:
+def test_bytes_that_the_head_s_own_process_holds_already_do_not_leave(driver: CoreDriver) -> None:
     """It loaded 3 GiB before it asked: they are a part of its 6. Only the other one's bytes are
     counted on."""
-    driver = CoreDriver(8 * GIB)
     eager = driver.consumer("eager")
     eager.hold(3 * GIB)
     stowaway(driver, 2)
@@ -342,8 +334,7 @@ def test_those_who_passed_are_no_room_for_the_next_to_pass() -> None:
     assert {note["lease_id"] for note in driver.notes("revoke_asked")} == {lease}
 
 
-def test_one_that_was_there_before_the_head_did_not_pass_it() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_one_that_was_there_before_the_head_did_not_pass_it(driver: CoreDriver) -> None:
     _, low = held_after_peak(driver, "low", 2, priority=10, min_residency_s=10.0)
     driver.advance(0.1)
     head = driver.consumer("head").acquire(6 * GIB)

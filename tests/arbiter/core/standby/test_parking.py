@@ -98,8 +98,7 @@ def test_without_room_the_revoke_says_so() -> None:
     assert driver.state(lease) == "revoking"
 
 
-def test_no_budget_no_parking() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_no_budget_no_parking(driver: CoreDriver) -> None:
     _, lease, _, _ = revoked_vlm(driver)
     assert driver.pushes("revoke", lease)[-1]["park"] is False
 

@@ -17,8 +17,7 @@ GIB = d.GIB
 
 
 # -- ends
-def test_giving_up_a_lease_on_standby() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_giving_up_a_lease_on_standby(driver: CoreDriver) -> None:
     det, lease, _, _ = sent_away(driver)
     assert answer(det.cancel(lease)) == {"state": "cancelled"}
     assert answer(det.cancel(lease)) == {"state": "cancelled"}, "a repeat"
@@ -26,15 +25,13 @@ def test_giving_up_a_lease_on_standby() -> None:
     assert f"lease:{lease}" not in driver.journal
 
 
-def test_a_repeat_of_the_release_does_not_end_it() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_repeat_of_the_release_does_not_end_it(driver: CoreDriver) -> None:
     det, lease, _, _ = sent_away(driver)
     assert answer(det.release(lease))["state"] == "standby"
     assert driver.state(lease) == "standby"
 
 
-def test_requests_that_make_no_sense_away_are_refused() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_requests_that_make_no_sense_away_are_refused(driver: CoreDriver) -> None:
     det, lease, _, _ = sent_away(driver)
     assert refusal(det.ready(lease)).code == "bad_state"
     assert refusal(det.use_begin(lease)).code == "bad_state"
@@ -44,8 +41,7 @@ def test_requests_that_make_no_sense_away_are_refused() -> None:
 
 
 @pytest.mark.parametrize("reason", ["bye", "silent while connections were needed"])
-def test_it_ends_with_its_connection(reason: str) -> None:
-    driver = CoreDriver(8 * GIB)
+def test_it_ends_with_its_connection(driver: CoreDriver, reason: str) -> None:
     det, lease, _, _ = sent_away(driver)
     det.leave(reason)
     assert driver.state(lease) == "over"
@@ -54,9 +50,9 @@ def test_it_ends_with_its_connection(reason: str) -> None:
 
 @pytest.mark.parametrize("end", [Consumer.leave, Consumer.die], ids=["connection", "process"])
 def test_who_ends_during_the_measurement_does_not_want_it_back(
+    driver: CoreDriver,
     end: Callable[[Consumer], object],
 ) -> None:
-    driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, standby=True)
     policy = driver.consumer("policy")
     wanted = policy.acquire(5 * GIB)
@@ -67,8 +63,7 @@ def test_who_ends_during_the_measurement_does_not_want_it_back(
     assert driver.state(lease) == "over"
 
 
-def test_it_ends_with_its_process() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_it_ends_with_its_process(driver: CoreDriver) -> None:
     det, lease, _, _ = sent_away(driver)
     det.die()
     assert driver.state(lease) == "over"
@@ -76,8 +71,7 @@ def test_it_ends_with_its_process() -> None:
 
 
 # -- operators
-def test_whom_an_operator_evicts_does_not_come_back() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_whom_an_operator_evicts_does_not_come_back(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, standby=True)
     order(driver, "evict", lease)
     det.unload(lease)
@@ -107,8 +101,7 @@ def test_an_operators_word_outweighs_the_engines() -> None:
     assert driver.pushes("lost", lease)[-1]["error"]["code"] == "lease_lost"
 
 
-def test_evicting_one_that_leaves_by_itself_is_fine() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_evicting_one_that_leaves_by_itself_is_fine(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, standby=True)
     det.unload(lease)
     order(driver, "evict", lease)
@@ -116,8 +109,7 @@ def test_evicting_one_that_leaves_by_itself_is_fine() -> None:
     assert f"lease:{lease}" not in driver.journal
 
 
-def test_an_operators_eviction_outlives_a_restart() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_an_operators_eviction_outlives_a_restart(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, standby=True)
     token = det.token(lease)
     order(driver, "evict", lease)
@@ -129,8 +121,7 @@ def test_an_operators_eviction_outlives_a_restart() -> None:
     assert f"lease:{lease}" not in driver.journal
 
 
-def test_what_an_operator_evicted_and_its_holder_thinks_away_is_over() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_what_an_operator_evicted_and_its_holder_thinks_away_is_over(driver: CoreDriver) -> None:
     other, resident = held(driver, "other", 1)
     det, lease = held(driver, "det", 5, standby=True)
     token, other_token = det.token(lease), other.token(resident)
@@ -145,8 +136,7 @@ def test_what_an_operator_evicted_and_its_holder_thinks_away_is_over() -> None:
     assert f"lease:{lease}" not in driver.journal
 
 
-def test_a_pin_on_standby_holds_after_the_return() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_pin_on_standby_holds_after_the_return(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver)
     order(driver, "pin", lease)
     assert driver.journal[f"lease:{lease}"]["pinned"] == ["ops", "test"]
@@ -176,8 +166,7 @@ def test_it_may_come_back_on_another_gpu() -> None:
     assert view["gpu"] == "GPU-1", "beside nobody that it left for"
 
 
-def test_invariants_of_what_is_away() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_invariants_of_what_is_away(driver: CoreDriver) -> None:
     _, lease, _, _ = sent_away(driver)
     core = state_of(driver.arbiter)
     core.turn.granted.clear()

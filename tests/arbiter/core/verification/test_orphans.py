@@ -44,10 +44,9 @@ def test_the_verdict_does_not_depend_on_what_is_seen_first(read_first: bool) -> 
     driver.until(lambda: driver.state(wanted) == "loading")
 
 
-def test_bytes_that_were_given_back_long_ago_are_not_looked_for() -> None:
+def test_bytes_that_were_given_back_long_ago_are_not_looked_for(driver: CoreDriver) -> None:
     """A holder that freed its memory and dies later owes nothing: a program that took the room
     since is a stowaway, and no culprit."""
-    driver = CoreDriver()
     holder = driver.consumer("holder")
     lease = holder.acquire(4 * GIB)
     holder.load(lease)

@@ -27,8 +27,7 @@ def total_only(driver: CoreDriver) -> None:
 
 
 # -- verified
-def test_two_equal_readings_after_the_release_are_enough() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_two_equal_readings_after_the_release_are_enough(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
     det.unload(lease)
     took = driver.until(lambda: driver.state(lease) == "over", step_s=0.001)
@@ -156,8 +155,7 @@ def test_a_death_under_measurement_starts_the_dense_readings_anew() -> None:
     assert 1.0 < took <= 1.012
 
 
-def test_a_process_that_exits_has_to_give_back_even_its_context() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_process_that_exits_has_to_give_back_even_its_context(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
     det.unloading(lease)
     det.hold(450 * MIB)
@@ -169,8 +167,7 @@ def test_a_process_that_exits_has_to_give_back_even_its_context() -> None:
     assert driver.gpu()["charged_bytes"] == 0
 
 
-def test_another_holder_may_grow_up_to_its_charge_meanwhile() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_another_holder_may_grow_up_to_its_charge_meanwhile(driver: CoreDriver) -> None:
     a, first = held(driver, "a", 2)
     a.hold(1 * GIB)
     b, second = held(driver, "b", 4)
@@ -183,8 +180,7 @@ def test_another_holder_may_grow_up_to_its_charge_meanwhile() -> None:
     assert driver.state(first) == "held"
 
 
-def test_totals_alone_verify_by_what_the_lease_was_charged() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_totals_alone_verify_by_what_the_lease_was_charged(driver: CoreDriver) -> None:
     total_only(driver)
     a, first = held(driver, "a", 2)
     b, second = held(driver, "b", 4)
@@ -206,10 +202,9 @@ def test_totals_alone_verify_by_what_the_lease_was_charged() -> None:
     assert a.driver.state(first) == "held"
 
 
-def test_what_a_load_has_not_taken_yet_hides_nobodys_bytes() -> None:
+def test_what_a_load_has_not_taken_yet_hides_nobodys_bytes(driver: CoreDriver) -> None:
     """Regression (storm, seed 3): a dead holder's 500 MiB were measured gone behind the 500 that
     somebody was about to load."""
-    driver = CoreDriver(8 * GIB)
     total_only(driver)
     a, _ = held(driver, "a", 1)
     driver.advance(1.5)
@@ -259,8 +254,7 @@ def test_without_a_comparable_reading_the_ledger_bound_decides() -> None:
 
 
 # -- residue
-def test_a_living_process_that_keeps_too_much_is_charged_for_it() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_living_process_that_keeps_too_much_is_charged_for_it(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
     waiter = driver.consumer("w").acquire(6 * GIB)
     small = driver.consumer("small").acquire(4 * GIB)
@@ -280,8 +274,7 @@ def test_a_living_process_that_keeps_too_much_is_charged_for_it() -> None:
     assert driver.gpu()["charged_bytes"] == 6 * GIB + 450 * MIB, "it came back later: noticed"
 
 
-def test_totals_alone_charge_the_shortfall_to_the_process_that_let_go() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_totals_alone_charge_the_shortfall_to_the_process_that_let_go(driver: CoreDriver) -> None:
     total_only(driver)
     det, lease = held(driver, "det", 5)
     driver.advance(1.0)
@@ -294,8 +287,7 @@ def test_totals_alone_charge_the_shortfall_to_the_process_that_let_go() -> None:
 
 
 # -- contested
-def test_others_that_grew_are_named_and_charged_as_stowaways() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_others_that_grew_are_named_and_charged_as_stowaways(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, residue_bytes=100 * MIB)
     waiter = driver.consumer("w").acquire(7 * GIB)
     det.unloading(lease)
@@ -329,8 +321,7 @@ def test_what_nobody_in_the_list_explains_is_not_charged_to_who_is_in_it() -> No
     assert driver.gpu()["charged_bytes"] == 100 * MIB
 
 
-def test_a_dead_process_that_the_driver_still_lists_stays_charged() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_dead_process_that_the_driver_still_lists_stays_charged(driver: CoreDriver) -> None:
     driver.device.lag_s = 15.0
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("w").acquire(5 * GIB)
@@ -363,8 +354,7 @@ def test_totals_alone_and_a_dead_process_end_contested_if_the_ledger_explains_th
 
 
 # -- stale and unverifiable
-def test_no_reading_means_unknown_and_frees_nothing() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_no_reading_means_unknown_and_frees_nothing(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("w").acquire(5 * GIB)
     det.unloading(lease)
@@ -381,8 +371,7 @@ def test_no_reading_means_unknown_and_frees_nothing() -> None:
     assert len(driver.notes("probe_ok")) == 1
 
 
-def test_a_probe_that_never_answers_is_asked_again_and_again() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_probe_that_never_answers_is_asked_again_and_again(driver: CoreDriver) -> None:
     driver.device.silent = True
     driver.advance(3.0)
     waiter = driver.consumer("w").acquire(5 * GIB)
@@ -392,8 +381,7 @@ def test_a_probe_that_never_answers_is_asked_again_and_again() -> None:
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
 
 
-def test_a_list_without_byte_counts_is_no_evidence() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_list_without_byte_counts_is_no_evidence(driver: CoreDriver) -> None:
     driver.device.knows_bytes = False
     det, lease = held(driver, "det", 5)
     driver.advance(1.0)
@@ -404,8 +392,7 @@ def test_a_list_without_byte_counts_is_no_evidence() -> None:
     assert verdicts(driver) == [("residue", True)]
 
 
-def test_a_failed_reading_of_an_unknown_gpu_is_ignored() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_failed_reading_of_an_unknown_gpu_is_ignored(driver: CoreDriver) -> None:
     assert driver.post(ProbeFailed(GpuId("GPU-9"), driver.now, "no")) == []
 
 
@@ -427,8 +414,7 @@ def test_expired_bytes_stay_charged_until_measured_gone_after_the_holder_fenced_
     assert driver.gpu()["charged_bytes"] == 5 * GIB + 450 * MIB
 
 
-def test_a_lease_that_expires_while_it_loads_was_never_seen_complete() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_lease_that_expires_while_it_loads_was_never_seen_complete(driver: CoreDriver) -> None:
     hung = driver.consumer("hung")
     hung.acquire(5 * GIB, ttl_s=1.0)
     waiter = driver.consumer("w").acquire(5 * GIB)
@@ -442,9 +428,8 @@ def test_a_lease_that_expires_while_it_loads_was_never_seen_complete() -> None:
 
 
 # -- residues and their processes
-def test_the_residue_of_a_process_that_left_unseen_is_forgotten() -> None:
+def test_the_residue_of_a_process_that_left_unseen_is_forgotten(driver: CoreDriver) -> None:
     """A process that said bye and is neither connected nor on the GPU any more keeps nothing."""
-    driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
     det.unload(lease)
     driver.until(lambda: driver.state(lease) == "over")
@@ -481,8 +466,7 @@ def test_a_residue_of_a_process_listed_without_bytes_stays_until_a_reading_shows
     assert driver.gpu()["charged_bytes"] == 450 * MIB, "connected: it may use its context again"
 
 
-def test_two_debts_of_one_dead_process_are_measured_together() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_two_debts_of_one_dead_process_are_measured_together(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     first = det.acquire(2 * GIB)
     det.load(first)
