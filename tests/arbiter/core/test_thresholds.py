@@ -212,16 +212,6 @@ def test_a_load_on_a_gpu_in_trouble_is_not_waited_for(trouble: str) -> None:
 
 
 # -- who has not come back
-@pytest.mark.parametrize("count", [1, 3, 4])
-def test_up_to_three_who_have_not_come_back_are_named(driver: CoreDriver, count: int) -> None:
-    people = [held(driver, f"m{n}", 1)[0] for n in range(count)]
-    driver.restart()
-    named = ", ".join(f"m{n} (pid {who.process.pid})" for n, who in enumerate(people[:3]))
-    more = " and 1 more" if count == 4 else ""
-    assert (
-        driver.gpu()["blocked"]["text"]
-        == f"recovering after a restart: {named}{more} must reattach first"
-    )
 
 
 def ready_with(member: tuple[Consumer, LeaseId], count: int, says: int | None = None) -> None:

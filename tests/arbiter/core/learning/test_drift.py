@@ -3,6 +3,7 @@
 import pytest
 
 from tests.support.core_driver import CoreDriver, refusal
+from tests.support.scenes import shown
 from vram_arbiter.arbiter.core.effects import Sample
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, LeaseId
@@ -32,8 +33,7 @@ def lived(
 
 
 def charge(driver: CoreDriver, lease: LeaseId) -> float:
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     return float(view["charge_bytes"] / GIB)
 
 
@@ -76,8 +76,7 @@ def test_the_holders_own_word_counts_where_the_driver_lists_nobody(driver: CoreD
         GIB,
     )
     assert "above" in note["reason"]
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert view["drift_bytes"] == GIB
     (why,) = driver.why("det")["leases"]
     assert (why["drifted"], why["footprint"]["held_bytes"]) == (True, 3 * GIB)
@@ -106,8 +105,7 @@ def test_who_holds_less_than_declared_is_named_when_it_leaves(driver: CoreDriver
     det.ready(lease)
     driver.advance(3.0)
     assert driver.notes("drift") == []
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert view["drift_bytes"] == -GIB, "shown all the same"
     det.unload(lease)
     (note,) = driver.notes("drift")

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import START_S, CoreDriver, answer, as_wire, refusal
-from tests.support.scenes import held, order, sent_away
+from tests.support.scenes import held, order, sent_away, shown
 from vram_arbiter.arbiter.core.events import ProbeFailed
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.schemas import defaults as d
@@ -30,8 +30,7 @@ def only(found: list[Any]) -> Any:
 @pytest.mark.parametrize(("exclusive", "mode"), [(True, "exclusive"), (False, "shared")])
 def test_a_lease_as_it_is_shown(driver: CoreDriver, exclusive: bool, mode: str) -> None:
     person, lease = held(driver, "det", 2, exclusive=exclusive)
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert {
         key: view[key] for key in ("mode", "consumer", "model", "priority", "evictable", "uses")
     } == {
@@ -91,19 +90,6 @@ def test_why_of_a_resident_lease_asks_for_nothing(driver: CoreDriver) -> None:
         "plan": [],
         "text": "det: it is resident, idle",
     }
-
-
-def test_an_estimate_says_that_it_was_learnt() -> None:
-    driver = CoreDriver(
-        8 * GIB, settings={"learnt": {"loader": {"load_s": 1.0}, "vlm": {"load_s": 2.0}}}
-    )
-    loader = driver.consumer("loader")
-    loader.acquire(2 * GIB)
-    vlm = driver.consumer("vlm")
-    waiting = vlm.acquire(2 * GIB)  # fits; only the other one's load is in the way
-    assert driver.state(waiting) == "queued"
-    told = only(driver.why("vlm")["leases"])
-    assert (told["eta_s"], told["eta_source"]) == (3.0, "learnt"), "after the other's"
 
 
 # -- answers
@@ -289,15 +275,6 @@ def test_an_adopted_lease_says_where_it_comes_from(driver: CoreDriver) -> None:
 
 
 # -- waiting beside what nobody owns
-def test_a_small_one_may_pass_where_nobody_has_an_account(driver: CoreDriver) -> None:
-    driver.device.lists_processes = False
-    driver.device.set(ProcessKey(9, 9), 4 * GIB, driver.now)
-    driver.advance(2.0)
-    large = driver.consumer("large").acquire(6 * GIB)
-    small = driver.consumer("small").acquire(1 * GIB)
-    assert driver.state(large) == "queued"
-    driver.advance(1.0)
-    assert driver.state(small) in ("queued", "loading")
 
 
 def test_the_head_says_what_keeps_the_engine_from_asking(driver: CoreDriver) -> None:
@@ -360,14 +337,8 @@ def test_the_time_since_the_grant_outlives_a_restart(driver: CoreDriver) -> None
     det, lease = held(driver, "det", 2)
     driver.advance(1.0)
     det.renew((lease, det.token(lease)))
-    before = view_of(driver, lease)["granted_s"]
+    before = shown(driver, lease)["granted_s"]
     assert before == pytest.approx(1.0, abs=0.1)
     driver.restart()
-    assert view_of(driver, lease)["granted_s"] >= before
-    assert view_of(driver, lease)["since_s"] < 0.1, "it is in its present state since the restart"
-
-
-def view_of(driver: CoreDriver, lease: LeaseId) -> dict[str, Any]:
-    found = driver.view(lease)
-    assert found is not None
-    return found
+    assert shown(driver, lease)["granted_s"] >= before
+    assert shown(driver, lease)["since_s"] < 0.1, "it is in its present state since the restart"

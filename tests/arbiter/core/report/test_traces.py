@@ -50,11 +50,3 @@ def test_one_that_is_called_back_while_it_is_measured_too(driver: CoreDriver) ->
     policy.load(wanted)
     driver.until(lambda: bool(driver.pushes("revoke", wanted)))
     assert driver.pushes("revoke", wanted)[0]["traceparent"] == HIS
-
-
-def test_a_grant_says_whether_it_was_asked_for(driver: CoreDriver) -> None:
-    _, lease, policy, wanted = sent_away(driver)
-    assert not any("by_itself" in note for note in driver.notes("granted"))
-    policy.unload(wanted)
-    driver.until(lambda: driver.state(lease) == "loading")
-    assert driver.notes("granted")[-1]["by_itself"] is True

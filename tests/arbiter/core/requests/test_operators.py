@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.scenes import shown
 from vram_arbiter.arbiter.core.effects import Effect, Note, Signal
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
@@ -193,32 +194,18 @@ def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consum
     why = other.why("policy")["leases"][0]
     blocker = why["blockers"][0]
     assert (blocker["condition"], blocker["by"]) == ("pinned", f"{BY}: demo for the press")
-    view = other.view(lease)
-    assert view is not None
+    view = shown(other, lease)
     assert (view["evictable"], view["pinned"]) == (False, f"{BY}: demo for the press")
     order_of(operator, "unpin", lease, "")
     assert other.state(lease) == "revoking"
     assert other.notes("operator")[-1]["action"] == "unpin"
 
 
-def test_a_request_that_a_pin_is_in_the_way_of_waits_for_the_unpin(
-    driver: CoreDriver, ops: Consumer
-) -> None:
-    _, lease = held_bytes(driver, "det", 5 * GIB)
-    order_of(ops, "pin", lease)
-    waiter = driver.consumer("policy").acquire(4 * GIB)
-    driver.advance(10.0)
-    assert (driver.state(waiter), driver.state(lease)) == ("queued", "held")
-    order_of(ops, "unpin", lease, "")
-    assert driver.state(lease) == "revoking"
-
-
 def test_a_waiter_can_be_pinned_for_when_it_holds(driver: CoreDriver, ops: Consumer) -> None:
     det, _ = held_bytes(driver, "det", 5 * GIB, min_residency_s=100.0)
     waiting = driver.consumer("policy").acquire(4 * GIB)
     order_of(ops, "pin", waiting)
-    view = driver.view(waiting)
-    assert view is not None
+    view = shown(driver, waiting)
     assert view["pinned"].startswith(BY)
     del det
 
@@ -238,8 +225,7 @@ def test_a_pin_outlives_the_daemon(driver: CoreDriver, ops: Consumer) -> None:
     driver.restart()
     det.connect()
     det.reattach(lease, token)
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert view["pinned"] == f"{BY}: why not"
 
 
@@ -303,12 +289,6 @@ def test_a_lease_in_use_is_never_given_up(driver: CoreDriver, ops: Consumer) -> 
     det.use_begin(lease)
     driver.advance(450.0)
     assert "in use" in refusal(order_of(ops, "release_dead", lease)).message
-
-
-def test_a_waiter_has_nothing_to_be_given_up(driver: CoreDriver, ops: Consumer) -> None:
-    held_bytes(driver, "det", 5 * GIB, min_residency_s=100.0)
-    waiting = driver.consumer("policy").acquire(4 * GIB)
-    assert refusal(order_of(ops, "release_dead", waiting)).code == "bad_state"
 
 
 def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(

@@ -188,11 +188,6 @@ def test_whoever_has_not_come_back_is_named(driver: CoreDriver) -> None:
     block = driver.gpu()["blocked"]
     assert [name.split(" ")[0] for name in block["names"]] == ["m0", "m1", "m2"]
     assert (block["code"], block["more"]) == ("recovering", 2)
-    driver = CoreDriver(8 * GIB)
-    driver.device.set(driver.consumer("x").process, 1 * GIB, driver.now)
-    driver.post(Recovered({}))
-    block = driver.gpu()["blocked"]
-    assert (block["code"], block.get("names")) == ("recovering", None), "they are not known"
 
 
 def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> None:

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import CoreDriver, answer, refusal
+from tests.support.scenes import shown
 from vram_arbiter.arbiter.core.effects import JournalPut, Note, Push, Reply, Sample
 from vram_arbiter.arbiter.core.events import Asked
 from vram_arbiter.arbiter.core.model.records import LeaseRecord
@@ -317,8 +318,7 @@ def test_an_out_of_memory_raises_the_learnt_peak_of_its_model(driver: CoreDriver
     det.release(lease)
     driver.advance(1.0)
     again = det.acquire(2 * GIB)
-    view = driver.view(again)
-    assert view is not None
+    view = shown(driver, again)
     assert view["charge_bytes"] == 3 * GIB
     assert (
         answer(det.oom(again, 100 * GIB, 1 * GIB))["learnt_load_peak_bytes"]

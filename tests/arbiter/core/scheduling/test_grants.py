@@ -182,21 +182,6 @@ def test_a_load_peak_that_is_not_back_yet_carries_no_grant() -> None:
     driver.until(lambda: driver.state(vlm) == "loading", limit_s=3.0)
 
 
-def test_an_exclusive_lease_that_expired_keeps_others_out_until_it_is_measured_gone() -> None:
-    """Regression: its debt kept its bytes charged, but a neighbour came in while its hung holder
-    was still on the GPU."""
-    driver = CoreDriver(8 * GIB)
-    hung = driver.consumer("hung")
-    lease = hung.acquire(2 * GIB, exclusive=True, ttl_s=2.0)
-    hung.load(lease)
-    waiter = driver.consumer("w").acquire(1 * GIB, evictable=False)
-    driver.until(lambda: driver.state(lease) == "over", limit_s=5.0)
-    driver.advance(8.0)
-    assert driver.state(waiter) == "queued"
-    hung.hold(0)
-    driver.until(lambda: driver.state(waiter) == "loading", limit_s=10.0)
-
-
 # -- pressure
 def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder(driver: CoreDriver) -> None:
     calm, calm_lease = held(driver, "calm", 2)
@@ -258,32 +243,6 @@ def test_ready_with_more_than_granted_is_pressure_and_no_violation(driver: CoreD
 
 
 # -- several GPUs
-def test_any_takes_the_first_gpu_where_it_fits_without_asking() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
-    a, b = driver.consumer("a"), driver.consumer("b")
-    first = a.acquire(5 * GIB)
-    second = b.acquire(5 * GIB)
-    assert [view["gpu"] for view in (driver.view(first), driver.view(second)) if view] == [
-        "GPU-0",
-        "GPU-1",
-    ]
-
-
-def test_any_empties_the_cheaper_gpu_only() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
-    dear, dear_lease = held(driver, "dear", 5, priority=80, gpu="0")
-    cheap, cheap_lease = held(driver, "cheap", 5, priority=20, gpu="1")
-    person = driver.consumer("w")
-    waiter = person.acquire(5 * GIB)
-    assert (driver.state(dear_lease), driver.state(cheap_lease)) == ("held", "revoking")
-    driver.advance(5.0)
-    assert driver.state(dear_lease) == "held"
-    cheap.unload(cheap_lease)
-    driver.until(lambda: driver.state(waiter) == "loading")
-    view = driver.view(waiter)
-    assert view is not None
-    assert view["gpu"] == "GPU-1"
-    assert dear.driver is driver
 
 
 def test_any_waits_for_room_that_comes_on_another_gpu() -> None:

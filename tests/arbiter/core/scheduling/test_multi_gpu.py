@@ -1,12 +1,11 @@
 """Several GPUs: a lease is placed on one of them and never split, every GPU has its own queue,
 and no GPU waits for another's sake."""
 
-import random
+from typing import Any
 
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.full_check import check_arbiter
 from tests.support.scenes import held, place
 from vram_arbiter.arbiter.core.events import ProcessDied
 from vram_arbiter.schemas import defaults as d
@@ -32,11 +31,6 @@ def test_a_selector_is_an_uuid_an_index_or_any(selector: str, wanted: GpuId) -> 
     assert [driver.gpu(n)["charged_bytes"] for n in (0, 1)] == [
         5 * GIB if wanted is gpu else 0 for gpu in (ZERO, ONE)
     ]
-
-
-def test_an_unknown_gpu_is_named_with_those_that_are_there(driver: CoreDriver) -> None:
-    refused = refusal(driver.consumer("a").try_acquire(1 * GIB, gpu="GPU-7"))
-    assert (refused.code, refused.details["known"]) == ("unknown_gpu", [ZERO, ONE])
 
 
 def test_a_lease_is_never_split(driver: CoreDriver) -> None:
@@ -240,19 +234,6 @@ def test_a_load_without_end_is_not_waited_for_for_ever(driver: CoreDriver) -> No
     assert (place(driver, lease), driver.state(stuck)) == (ZERO, "loading")
 
 
-def test_one_that_names_its_gpu_waits_for_it_beside_an_empty_one(driver: CoreDriver) -> None:
-    busy, lease = held(driver, "busy", 6, gpu="1", priority=90)
-    busy.use_begin(lease)
-    waiter = driver.consumer("w").acquire(6 * GIB, gpu="GPU-1")
-    driver.advance(30.0)
-    assert (driver.state(waiter), driver.gpu(0)["charged_bytes"]) == ("queued", 0)
-    assert driver.view(waiter)["position"] == 1  # type: ignore[index]
-    busy.use_end(lease)
-    busy.unload(lease)
-    driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
-    assert place(driver, waiter) == ONE
-
-
 # -- order and ageing
 def test_whoever_came_first_is_first_on_every_gpu(driver: CoreDriver) -> None:
     people = [held(driver, f"busy{n}", 6, gpu=str(n), priority=90) for n in (0, 1)]
@@ -371,30 +352,21 @@ def test_standby_does_not_return_to_a_gpu_that_cannot_be_read(driver: CoreDriver
 
 
 # -- GPUs that fail, drains
-def test_a_gpu_that_cannot_be_read_blocks_itself_only(driver: CoreDriver) -> None:
-    driver.devices[ZERO].failing = "NVML_ERROR_GPU_IS_LOST"
-    driver.advance(1.5)
-    anywhere = driver.consumer("a").acquire(5 * GIB)
+@pytest.mark.parametrize("trouble", [{"failing": "NVML_ERROR_GPU_IS_LOST"}, {"silent": True}])
+def test_a_gpu_that_cannot_be_read_blocks_itself_only(
+    driver: CoreDriver, trouble: dict[str, Any]
+) -> None:
+    for name, value in trouble.items():
+        setattr(driver.devices[ZERO], name, value)
+    driver.advance(5.0)
+    there = driver.consumer("there").acquire(5 * GIB, gpu="0")
+    anywhere = driver.consumer("anywhere").acquire(5 * GIB)
     driver.until(lambda: driver.state(anywhere) == "loading", limit_s=1.0)
     assert place(driver, anywhere) == ONE
-    there = driver.consumer("b").acquire(5 * GIB, gpu="0")
     driver.advance(10.0)
     assert driver.state(there) == "queued"
-    driver.devices[ZERO].failing = ""
-    driver.until(lambda: driver.state(there) == "loading", limit_s=2.0)
-
-
-def test_a_gpu_whose_reading_hangs_blocks_itself_only(driver: CoreDriver) -> None:
-    driver.devices[ONE].silent = True
-    driver.advance(5.0)
-    there = driver.consumer("there").acquire(5 * GIB, gpu="1")
-    here = driver.consumer("here").acquire(5 * GIB)
-    driver.advance(5.0)
-    assert (driver.state(there), driver.state(here), place(driver, here)) == (
-        "queued",
-        "loading",
-        ZERO,
-    )
+    driver.devices[ZERO].failing, driver.devices[ZERO].silent = "", False
+    driver.until(lambda: driver.state(there) == "loading", limit_s=3.0)
 
 
 def test_a_gpu_that_is_lost_keeps_its_leases_and_the_others_go_on(driver: CoreDriver) -> None:
@@ -468,61 +440,3 @@ def test_without_a_journal_a_lease_is_found_on_the_gpu_that_shows_its_process(li
 
 
 # -- at random
-@pytest.mark.parametrize("seed", range(8))
-def test_whatever_happens_no_gpu_overflows_and_everybody_is_served(seed: int) -> None:
-    draw = random.Random(seed)
-    driver = CoreDriver(8 * GIB, gpus=3)
-    for one in driver.devices.values():
-        one.lag_s = draw.choice([0.0, 0.2])
-    people = [driver.consumer(f"p{n}") for n in range(5)]
-    mine: dict[LeaseId, Consumer] = {}
-    for _ in range(60):
-        person = draw.choice(people)
-        live = [
-            lease
-            for lease, owner in mine.items()
-            if owner is person and driver.state(lease) != "over"
-        ]
-        if not live:
-            size = draw.choice([1, 2, 3, 5, 7]) * GIB
-            spec = {
-                "gpu": draw.choice(["any", "any", "0", "1", "GPU-2"]),
-                "priority": draw.choice([40, 50, 60]),
-            }
-            mine[person.acquire(size, **spec)] = person
-        for lease in live:
-            step(driver, draw, person, lease)
-        driver.advance(draw.choice([0.01, 0.3, 2.0]))
-        for one in driver.devices.values():
-            assert sum(one.shown(driver.now).values()) <= 8 * GIB
-    for _ in range(400):
-        waiting = [lease for lease in mine if driver.state(lease) == "queued"]
-        if not waiting:
-            break
-        for lease, person in mine.items():
-            step(driver, random.Random(0), person, lease, willing=True)
-        driver.advance(0.2)
-    assert not [lease for lease in mine if driver.state(lease) == "queued"]
-    check_arbiter(driver.arbiter)
-
-
-def step(
-    driver: CoreDriver,
-    draw: random.Random,
-    person: Consumer,
-    lease: LeaseId,
-    *,
-    willing: bool = False,
-) -> None:
-    """What its holder does next with a lease."""
-    view = driver.view(lease)
-    if view is None:
-        return
-    if view["state"] == "loading":
-        person.load(lease)
-    elif view["uses"] and (willing or draw.random() < 0.5):
-        person.use_end(lease)
-    elif view["state"] == "revoking" and not view["uses"]:
-        person.unload(lease)
-    elif view["state"] == "held" and not view["uses"] and not willing:
-        person.use_begin(lease)

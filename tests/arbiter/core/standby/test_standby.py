@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.scenes import held, sent_away
+from tests.support.scenes import held, sent_away, shown
 from vram_arbiter.arbiter.core.events import ProcessDied
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
@@ -29,8 +29,7 @@ def test_the_detector_returns_by_itself_after_the_grab(driver: CoreDriver) -> No
     assert granted["lease"]["lease_id"] == lease
     assert det.token(lease) > before, "a fresh token"
     det.load(lease)
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert (view["state"], view["standby"], view["charge_bytes"]) == ("held", True, 5 * GIB)
     assert driver.notes("granted")[-1]["by_itself"] is True
     assert driver.notes("switch")[-1]["switched"] is False
@@ -38,8 +37,7 @@ def test_the_detector_returns_by_itself_after_the_grab(driver: CoreDriver) -> No
 
 def test_what_standby_looks_like(driver: CoreDriver) -> None:
     det, lease, _, _ = sent_away(driver)
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert (view["gpu"], view["charge_bytes"], view["uses"]) == (None, 0, 0)
     assert "ttl_left_s" not in view
     assert "position" not in view
@@ -377,8 +375,7 @@ def test_a_new_acquire_of_the_same_model_takes_the_lease_over(driver: CoreDriver
     assert answer(det.try_acquire(4 * GIB, nonce="again"))["lease"]["lease_id"] == lease, "a repeat"
     policy.unload(wanted)
     driver.until(lambda: driver.state(lease) == "loading")
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert view["charge_bytes"] == 4 * GIB, "as it is asked for now"
     other = answer(det.try_acquire(1 * GIB, key="another"))
     assert other["lease"]["lease_id"] != lease
@@ -402,8 +399,7 @@ def test_a_lease_that_was_taken_over_comes_back_as_it_was_asked_for_last() -> No
     det.reacquire(lease)
     policy.unload(wanted)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert view["charge_bytes"] == 6 * GIB
 
 

@@ -6,11 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.engine_state import state_of
 from tests.support.scenes import held, order, sent_away
-from vram_arbiter.arbiter.core import invariants
-from vram_arbiter.arbiter.core.invariants import InvariantViolation
-from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
@@ -149,32 +145,3 @@ def test_a_pin_on_standby_holds_after_the_return(driver: CoreDriver) -> None:
 
 
 # -- several GPUs, invariants
-def test_it_may_come_back_on_another_gpu() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
-    det, lease = held(driver, "det", 5, standby=True)
-    other, second = held(driver, "other", 5)
-    policy = driver.consumer("policy")
-    wanted = policy.acquire(5 * GIB, gpu="0")
-    driver.until(lambda: driver.state(lease) == "revoking")
-    det.unload(lease)
-    driver.until(lambda: driver.state(wanted) == "loading")
-    policy.load(wanted)
-    other.unload(second)
-    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
-    view = driver.view(lease)
-    assert view is not None
-    assert view["gpu"] == "GPU-1", "beside nobody that it left for"
-
-
-def test_invariants_of_what_is_away(driver: CoreDriver) -> None:
-    _, lease, _, _ = sent_away(driver)
-    core = state_of(driver.arbiter)
-    core.turn.granted.clear()
-    one = core.leases[lease]
-    one.state = LeaseState.HELD
-    with pytest.raises(InvariantViolation, match="counts as away"):
-        invariants.check(core)
-    one.state = LeaseState.STANDBY
-    one.gpu = next(iter(core.gpus))
-    with pytest.raises(InvariantViolation, match="it has a GPU"):
-        invariants.check(core)

@@ -1,7 +1,7 @@
 """A restart of the daemon loses no lease on standby, at whichever step of its way it comes."""
 
 from tests.support.core_driver import CoreDriver, answer, refusal
-from tests.support.scenes import held, sent_away
+from tests.support.scenes import held, sent_away, shown
 from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.arbiter.core.events import ClientConnected, Recovered
 from vram_arbiter.arbiter.host.records import records_of
@@ -224,8 +224,7 @@ def test_a_held_lease_that_the_journal_lost_still_goes_on_standby(driver: CoreDr
     driver.restart(keep_journal=False)
     det.connect()
     det.reattach(lease, token)
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert view["standby"] is True
     driver.advance(20.0)  # holders that the lost journal did not name had their time
     policy = driver.consumer("policy")

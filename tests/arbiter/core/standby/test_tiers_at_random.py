@@ -25,7 +25,7 @@ class Crowd:
     def __init__(self, seed: int) -> None:
         self.draw = random.Random(seed)
         settings = {"host_ram_budget_bytes": 6 * GIB, "thrash_hold_max_s": 3.0}
-        self.driver = CoreDriver(CAPACITY, gpus=self.draw.choice([1, 2]), settings=settings)
+        self.driver = CoreDriver(CAPACITY, gpus=self.draw.choice([1, 2, 3]), settings=settings)
         for device in self.driver.devices.values():
             device.lag_s = self.draw.choice([0.0, 0.1])
         self.people = [self.driver.consumer(f"p{n}") for n in range(4)]
@@ -42,6 +42,7 @@ class Crowd:
     def acquire(self, person: Consumer) -> None:
         size = self.draw.choice([1, 2, 3, 5, 7]) * GIB
         spec = {
+            "gpu": self.draw.choice(["any", "any", "0"]),
             "standby": self.draw.random() < 0.6,
             "park_bytes": self.draw.choice([0, size]),
             "priority": self.draw.choice([40, 50, 60]),
