@@ -56,14 +56,22 @@ def why(driver: CoreDriver, consumer: str) -> dict[str, Any]:
     return found
 
 
-def sent_away(
+def revoked(
     driver: CoreDriver, gib: float = 5, policy_gib: float = 5, **spec: Any
 ) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
-    """A detector on standby, and the policy that it left for, resident."""
+    """A detector that comes back from standby, revoked, and the policy that waits for its room."""
     det, lease = held(driver, "det", gib, standby=True, **spec)
     policy = driver.consumer("policy")
     wanted = policy.acquire(int(policy_gib * GIB))
     driver.until(lambda: driver.state(lease) == "revoking")
+    return det, lease, policy, wanted
+
+
+def sent_away(
+    driver: CoreDriver, gib: float = 5, policy_gib: float = 5, **spec: Any
+) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
+    """A detector on standby, and the policy that it left for, resident."""
+    det, lease, policy, wanted = revoked(driver, gib, policy_gib, **spec)
     det.unload(lease)
     driver.until(lambda: driver.state(wanted) == "loading")
     assert driver.state(lease) == "standby"

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.scenes import held, sent_away, shown
+from tests.support.scenes import held, revoked, sent_away, shown
 from vram_arbiter.arbiter.core.events import ProcessDied
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
@@ -64,9 +64,7 @@ def test_it_never_comes_back_beside_the_one_that_it_left_for() -> None:
 def test_cancel_on_the_way_to_standby_is_heard(driver: CoreDriver) -> None:
     """Regression: it was refused while the bytes were measured, and the lease came back to a holder
     that did not want it."""
-    det, lease = held(driver, "det", 5, standby=True)
-    driver.consumer("policy").acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, _, _ = revoked(driver)
     driver.device.lag_s = 0.5
     det.unload(lease)
     assert driver.state(lease) == "verifying"
@@ -234,9 +232,7 @@ def test_who_leaves_unasked_does_not_want_back(driver: CoreDriver) -> None:
 
 
 def test_who_exits_does_not_come_back(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5, standby=True)
-    driver.consumer("policy").acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, _, _ = revoked(driver)
     det.hold(0)
     det.release(lease, exiting=True)
     driver.until(lambda: driver.state(lease) == "over")
@@ -315,10 +311,7 @@ def test_a_late_repeat_of_reacquire_asks_for_nothing(driver: CoreDriver) -> None
 
 
 def test_reacquire_on_the_way_out_waits_for_the_verdict(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5, standby=True)
-    policy = driver.consumer("policy")
-    wanted = policy.acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, _, wanted = revoked(driver)
     assert refusal(det.reacquire(lease)).code == "bad_state", "it has not let go"
     det.unload(lease)
     assert answer(det.reacquire(lease, wait_timeout_s=30.0))["state"] == "queued"
@@ -339,10 +332,7 @@ def test_reacquire_of_what_is_not_coming_back_is_refused(driver: CoreDriver) -> 
 
 def test_reacquire_that_can_never_fit_changes_nothing(driver: CoreDriver) -> None:
     """It was granted once; after a restart there is a smaller GPU."""
-    det, lease = held(driver, "det", 5, standby=True)
-    policy = driver.consumer("policy")
-    wanted = policy.acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, policy, wanted = revoked(driver)
     det.unload(lease)
     driver.until(lambda: driver.state(wanted) == "loading")
     token = det.token(lease)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.scenes import held, order, sent_away
+from tests.support.scenes import held, order, revoked, sent_away
 from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
@@ -49,10 +49,7 @@ def test_who_ends_during_the_measurement_does_not_want_it_back(
     driver: CoreDriver,
     end: Callable[[Consumer], object],
 ) -> None:
-    det, lease = held(driver, "det", 5, standby=True)
-    policy = driver.consumer("policy")
-    wanted = policy.acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, _, wanted = revoked(driver)
     det.unload(lease)
     end(det)
     driver.until(lambda: driver.state(wanted) == "loading")
@@ -80,10 +77,7 @@ def test_an_operators_word_outweighs_the_engines() -> None:
     for steps in range(3):
         driver = CoreDriver(8 * GIB)
         driver.device.lag_s = 0.3
-        det, lease = held(driver, "det", 5, standby=True)
-        policy = driver.consumer("policy")
-        wanted = policy.acquire(5 * GIB)
-        driver.until(lambda: driver.state(lease) == "revoking")  # noqa: B023  # reason: run at once
+        det, lease, _, wanted = revoked(driver)
         if steps > 0:
             det.unload(lease)
         if steps > 1:

@@ -1,7 +1,7 @@
 """A restart of the daemon loses no lease on standby, at whichever step of its way it comes."""
 
 from tests.support.core_driver import CoreDriver, answer, refusal
-from tests.support.scenes import held, sent_away, shown
+from tests.support.scenes import held, revoked, sent_away, shown
 from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.arbiter.core.events import ClientConnected, Recovered
 from vram_arbiter.arbiter.host.records import records_of
@@ -80,10 +80,7 @@ def test_only_leases_on_standby_in_the_journal_hold_up_nobody(driver: CoreDriver
 
 def test_a_restart_in_the_middle_of_the_way_out_does_not_make_it_a_wish(driver: CoreDriver) -> None:
     """The holder was asked before the restart and lets go after it: it still comes back."""
-    det, lease = held(driver, "det", 5, standby=True)
-    policy = driver.consumer("policy")
-    policy.acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, policy, wanted = revoked(driver)
     token = det.token(lease)
     driver.restart()
     assert driver.state(lease) == "held", (
@@ -121,9 +118,7 @@ def test_a_restart_does_not_let_a_revoke_outrun_the_uses_of_others(driver: CoreD
 
 def test_a_restart_during_the_measurement(driver: CoreDriver) -> None:
     driver.device.lag_s = 0.5
-    det, lease = held(driver, "det", 5, standby=True)
-    driver.consumer("policy").acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, _, _ = revoked(driver)
     token = det.token(lease)
     det.unload(lease)
     driver.restart()
@@ -136,9 +131,7 @@ def test_a_restart_during_the_measurement(driver: CoreDriver) -> None:
 
 def test_a_release_that_was_lost_is_made_up_for(driver: CoreDriver) -> None:
     """The daemon died with the release in its socket: the holder says that it let go."""
-    det, lease = held(driver, "det", 5, standby=True)
-    driver.consumer("policy").acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, _, _ = revoked(driver)
     token = det.token(lease)
     other, resident = held(driver, "other", 1)
     driver.advance(0.01)
@@ -156,9 +149,7 @@ def test_a_release_that_was_lost_is_made_up_for(driver: CoreDriver) -> None:
 
 def test_after_a_restart_its_holder_says_that_it_left_and_not_an_empty_gpu() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5, standby=True)
-    driver.consumer("policy").acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, _, _ = revoked(driver)
     token = det.token(lease)
     det.hold(0)
     driver.restart()
