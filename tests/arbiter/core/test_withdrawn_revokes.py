@@ -6,6 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.scenes import held, order
 from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.schemas import defaults as d
@@ -13,16 +14,6 @@ from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.pushes import RevokePush, RevokeWithdrawnPush
 
 GIB = d.GIB
-
-
-def held(driver: CoreDriver, name: str, gib: float, **spec: object) -> tuple[Consumer, LeaseId]:
-    """A loaded holder."""
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)  # type: ignore[arg-type]
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
 
 
 def revoked_in_use(
@@ -36,12 +27,6 @@ def revoked_in_use(
     driver.until(lambda: driver.state(lease) == "revoking")
     holder.ack(lease)
     return holder, lease, waiter, wanted
-
-
-def evict(driver: CoreDriver, lease: LeaseId) -> None:
-    """An operator's order."""
-    ops = driver.consumer("ops")
-    ops.order("evict", lease)
 
 
 LEAVES: dict[str, Callable[[CoreDriver, Consumer, LeaseId], object]] = {
@@ -152,7 +137,7 @@ def test_only_what_another_waiter_needs_stays_revoked(driver: CoreDriver) -> Non
 
 def test_an_operators_order_stands(driver: CoreDriver) -> None:
     holder, lease, waiter, wanted = revoked_in_use(driver)
-    evict(driver, lease)
+    order(driver, "evict", lease)
     waiter.cancel(wanted)
     driver.advance(1.0)
     assert driver.state(lease) == "revoking"
@@ -252,7 +237,7 @@ def test_a_waiter_that_leaves_before_its_grant_leaves_no_eviction_behind() -> No
 
 def test_an_operators_eviction_makes_no_switch(driver: CoreDriver) -> None:
     holder, lease = held(driver, "train", 5)
-    evict(driver, lease)
+    order(driver, "evict", lease)
     holder.unload(lease)
     driver.until(lambda: driver.state(lease) == "over")
     _, later = held(driver, "later", 5)
@@ -285,17 +270,12 @@ def test_of_two_gpus_emptied_for_one_waiter_each_holder_is_told_once() -> None:
     assert [driver.state(lease) for lease in leases] == ["revoking", "held"]
 
 
-def drain(driver: CoreDriver) -> None:
-    ops = driver.consumer("ops")
-    ops.order("drain")
-
-
 def test_on_a_gpu_that_grants_nothing_a_revoke_is_withdrawn_too(driver: CoreDriver) -> None:
     """A drain lasts as long as its operator wants."""
     _, lease, waiter, wanted = revoked_in_use(driver)
     small = driver.consumer("small").acquire(GIB)
     assert driver.state(small) == "loading", "backfilled"
-    drain(driver)
+    driver.consumer("ops").order("drain")
     waiter.cancel(wanted)
     assert driver.state(lease) == "held"
 
@@ -304,7 +284,7 @@ def test_on_a_gpu_that_grants_nothing_the_next_waiter_takes_over(driver: CoreDri
     """It kept the name of the waiter that was gone."""
     _, lease, waiter, wanted = revoked_in_use(driver)
     driver.consumer("later").acquire(5 * GIB)
-    drain(driver)
+    driver.consumer("ops").order("drain")
     waiter.cancel(wanted)
     assert driver.state(lease) == "revoking"
     assert not driver.pushes("revoke_withdrawn")

@@ -101,15 +101,6 @@ def test_an_acquire_said_again_after_the_load_is_answered_as_granted(driver: Cor
     assert (again["state"], again["lease"]["state"]) == ("loading", "held")
 
 
-def test_what_never_fits_says_the_way_out(driver: CoreDriver) -> None:
-    refused = refusal(driver.consumer("big").try_acquire(8 * GIB))
-    assert (refused.code, refused.hint) == (
-        "vram_insufficient",
-        "use a smaller model or a lower precision",
-    )
-    assert refused.message == "big needs 8 GiB; the GPU has 8 GiB less a reserve of 300 MiB"
-
-
 def test_refusals_of_operators_say_why(driver: CoreDriver) -> None:
     _, lease = held(driver, "det", 5)
     waiting = driver.consumer("vlm").acquire(5 * GIB)
@@ -159,17 +150,6 @@ def test_a_switch_is_noted_with_what_each_victim_held(driver: CoreDriver) -> Non
     }
 
 
-def test_a_denial_is_noted_with_its_reason(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
-    vlm = driver.consumer("vlm")
-    wanted = vlm.acquire(5 * GIB, wait_timeout_s=1.0)
-    driver.advance(1.1)
-    (push,) = driver.pushes("denied", wanted)
-    note = only(driver.notes("denied"))
-    assert (note["code"], note["reason"]) == ("wait_timeout", push["error"]["message"])
-
-
 def test_pressure_and_outages_are_noted_with_their_gpu(driver: CoreDriver) -> None:
     held(driver, "det", 5)
     driver.device.set(ProcessKey(9, 9), 3 * GIB, driver.now)
@@ -179,13 +159,6 @@ def test_pressure_and_outages_are_noted_with_their_gpu(driver: CoreDriver) -> No
     driver.advance(2.0)
     note = only(driver.notes("probe_failed"))
     assert (note["gpu"], note["reason"]) == ("GPU-0", "the driver is gone")
-
-
-def test_orders_are_noted_by_their_name(driver: CoreDriver) -> None:
-    ops = driver.consumer("ops")
-    for action in ("drain", "resume"):
-        ops.order(action)
-    assert [note["action"] for note in driver.notes("operator")] == ["drain", "resume"]
 
 
 def test_who_is_parked_is_noted_with_its_host_ram() -> None:
@@ -303,23 +276,6 @@ def test_an_answer_to_revoke_is_noted_with_its_lease(driver: CoreDriver) -> None
     det.ack(lease, eta_s=0.5)
     note = only(driver.notes("revoke_acked"))
     assert (note["lease_id"], note["safe_point_eta_s"], note["uses"]) == (lease, 0.5, 0)
-
-
-def test_what_is_not_kept_after_a_restart_is_told_by_its_name_and_why(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 3)
-    token = det.token(lease)
-    driver.restart()
-    thief = driver.consumer("thief")
-    (told,) = answer(thief.reattach(lease, token, spec=det.specs[lease]))["leases"]
-    assert (told["lease_id"], told["kept"]) == (lease, False)
-    assert (told["error"]["code"], told["error"]["hint"]) == ("not_permitted", "ask as its holder")
-
-
-def test_a_use_of_a_lease_that_was_asked_to_leave_is_told_to_wait(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5)
-    driver.consumer("vlm").acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
-    assert refusal(det.use_begin(lease)).hint == "wait until it is granted again"
 
 
 def test_a_gpu_is_stale_when_its_newest_reading_may_gate_no_grant(driver: CoreDriver) -> None:

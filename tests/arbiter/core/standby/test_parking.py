@@ -86,18 +86,14 @@ def test_room_is_kept_from_the_revoke_until_it_lets_go() -> None:
     driver.until(lambda: driver.state(lease) == "over")
 
 
-def test_without_room_the_revoke_says_so() -> None:
-    driver = driver_with(4)
+@pytest.mark.parametrize("budget_gib", [4, 0])
+def test_without_room_the_revoke_says_so(budget_gib: int) -> None:
+    driver = driver_with(budget_gib)
     vlm, lease, _, _ = revoked_vlm(driver)
     assert driver.pushes("revoke", lease)[-1]["park"] is False
     assert ram(driver) == 0
     assert refusal(vlm.release(lease, parked=True)).code == "host_ram_insufficient"
     assert driver.state(lease) == "revoking"
-
-
-def test_no_budget_no_parking(driver: CoreDriver) -> None:
-    _, lease, _, _ = revoked_vlm(driver)
-    assert driver.pushes("revoke", lease)[-1]["park"] is False
 
 
 def test_who_declared_nothing_cannot_park_and_who_exits_keeps_nothing() -> None:
