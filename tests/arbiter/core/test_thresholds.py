@@ -214,15 +214,6 @@ def test_a_load_on_a_gpu_in_trouble_is_not_waited_for(trouble: str) -> None:
 # -- who has not come back
 
 
-def ready_with(member: tuple[Consumer, LeaseId], count: int, says: int | None = None) -> None:
-    """Loaded: it holds so much, and readings have seen it."""
-    who, lease = member
-    who.hold(count)
-    who.driver.advance(1.1)
-    who.ready(lease, count if says is None else says)
-    who.driver.advance(0.1)
-
-
 # -- residues in the journal
 def restarted_with(driver: CoreDriver, person: Consumer, **changes: Any) -> None:
     """A restart that finds another record of what the process keeps."""
