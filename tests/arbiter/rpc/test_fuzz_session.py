@@ -81,7 +81,7 @@ class RealCore:
         self.device = SimDevice(GPU, 8 * d.GIB)
         self.arbiter = Arbiter(Settings(epoch=1, gpus=(info,)), self.plant.now)
         self.executor = Executor(
-            self.plant.outbox,
+            self.plant,
             self,
             self,
             self._sample,
@@ -160,7 +160,6 @@ class Plant:
         self.connections: dict[bytes, KeptConnection] = {}
         self.serial = 0
         self.watched: set[ProcessKey] = set()
-        self.outbox: Any = self  # the executor's way out, until the table is there
         values: dict[str, Any] = {
             "sessions_max": 50,
             "processes_max": 1000, "rate_per_client_per_s": 1_000_000,
@@ -174,7 +173,6 @@ class Plant:
         )  # fmt: skip
         self.core: Any = Recording() if not real else RealCore(self)
         self.table = SessionTable(settings_, self.core, self._read, self, lambda: self.now)
-        self.outbox = self.table
 
     # Watch
     def take(self, process: ProcessKey, pidfd: int) -> bool:
@@ -185,18 +183,9 @@ class Plant:
     def drop(self, process: ProcessKey) -> None:
         self.watched.remove(process)
 
-    # the executor's way out
-    def reply(self, *arguments: Any) -> None:
-        self.table.reply(*arguments)
-
-    def refuse(self, *arguments: Any) -> None:
-        self.table.refuse(*arguments)
-
-    def push(self, *arguments: Any) -> None:
-        self.table.push(*arguments)
-
-    def broadcast(self, event: Mapping[str, Any]) -> None:
-        self.table.broadcast(event)
+    def __getattr__(self, name: str) -> Any:
+        """The executor's way out, until the table is there."""
+        return getattr(self.table, name)
 
     def _read(
         self,

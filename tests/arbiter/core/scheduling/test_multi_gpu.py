@@ -223,17 +223,6 @@ def test_while_somebody_loads_where_it_fits_nobody_is_asked_elsewhere(driver: Co
     assert not driver.notes("revoke_asked")
 
 
-def test_a_load_without_end_is_not_waited_for_for_ever(driver: CoreDriver) -> None:
-    holder, idle = held(driver, "idle", 6, gpu="0")
-    stuck = driver.consumer("stuck").acquire(1 * GIB, gpu="1")
-    lease = driver.consumer("w").acquire(6 * GIB)
-    deadline_s = driver.settings.revoke_deadline_s
-    driver.until(lambda: driver.state(idle) == "revoking", limit_s=deadline_s + 0.1)
-    holder.unload(idle)
-    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
-    assert (place(driver, lease), driver.state(stuck)) == (ZERO, "loading")
-
-
 # -- order and ageing
 def test_whoever_came_first_is_first_on_every_gpu(driver: CoreDriver) -> None:
     people = [held(driver, f"busy{n}", 6, gpu=str(n), priority=90) for n in (0, 1)]
@@ -273,20 +262,6 @@ def test_a_waiter_for_any_gpu_ages_on_all_of_them(driver: CoreDriver) -> None:
     driver.advance(3 * step_s)
     assert [driver.state(lease) for lease in leases] == ["held", "revoking"], "one GPU is enough"
     assert driver.state(waiter) == "queued"
-
-
-def test_a_newcomer_of_higher_priority_overtakes_on_its_gpu_only_until_the_other_has_aged() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
-    busy, lease = held(driver, "busy", 6, gpu="1", priority=99)
-    busy.use_begin(lease)
-    _, fills = held(driver, "fills", 6, gpu="0", evictable=False)
-    old = driver.consumer("old").acquire(5 * GIB, priority=50)
-    driver.advance(11 * driver.settings.ageing_s_per_point)
-    young = driver.consumer("young").acquire(5 * GIB, priority=60, gpu="1")
-    busy.use_end(lease)
-    busy.unload(lease)
-    driver.until(lambda: driver.state(old) == "loading", limit_s=1.0)
-    assert (place(driver, old), driver.state(young), driver.state(fills)) == (ONE, "queued", "held")
 
 
 # -- standby
@@ -332,23 +307,6 @@ def test_a_waiter_for_one_gpu_keeps_nobody_from_returning_to_another(driver: Cor
     waiter = driver.consumer("w").acquire(5 * GIB, gpu="0", priority=10)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
     assert (place(driver, lease), driver.state(waiter)) == (ONE, "queued")
-
-
-def test_standby_does_not_return_to_a_gpu_that_cannot_be_read(driver: CoreDriver) -> None:
-    filler, fills = held(driver, "filler", 6, gpu="1", evictable=False)
-    det, lease = held(driver, "det", 5, standby=True)
-    policy = driver.consumer("policy")
-    wanted = policy.acquire(5 * GIB, gpu="0")
-    det.unload(lease)
-    driver.until(lambda: driver.state(wanted) == "loading")
-    policy.load(wanted)
-    filler.unload(fills)
-    driver.devices[ONE].failing = "NVML_ERROR_GPU_IS_LOST"
-    driver.advance(20.0)
-    assert driver.state(lease) == "standby"
-    policy.unload(wanted)
-    driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
-    assert place(driver, lease) == ZERO
 
 
 # -- GPUs that fail, drains

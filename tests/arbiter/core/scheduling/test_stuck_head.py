@@ -1,7 +1,6 @@
 """A head that waits for bytes nobody can be asked for (a stowaway's, a context's) holds back only
 those who would be in its way later."""
 
-import random
 from typing import Any
 
 import pytest
@@ -138,44 +137,6 @@ def test_the_ageing_bound_holds_against_those_who_passed() -> None:
     late.use_end(lease)
     late.unload(lease)
     driver.until(lambda: driver.state(head) == "loading", limit_s=1.0)
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_whoever_passed_is_in_nobodys_way_when_the_stowaway_is_gone(seed: int) -> None:
-    draw = random.Random(seed)
-    driver = CoreDriver(8 * GIB)
-    keeper, kept = held_after_peak(driver, "keeper", 1, residue_bytes=draw.choice([0, 300 * MIB]))
-    if draw.random() < 0.5:
-        keeper.unload(kept)
-        driver.until(lambda: driver.state(kept) == "over")
-    stowaway(driver, draw.choice([2.5, 3, 4]))
-    head = driver.consumer("head").acquire(
-        int(draw.choice([5, 5.5, 6]) * GIB), priority=draw.choice([50, 60])
-    )
-    mine: dict[LeaseId, Consumer] = {}
-    for number in range(20):
-        person = driver.consumer(f"p{number}", priority=40)
-        mine[person.acquire(draw.choice([200 * MIB, GIB // 2, GIB, 2 * GIB]))] = person
-        driver.advance(0.3)
-        for lease, owner in mine.items():
-            if driver.state(lease) == "loading":
-                owner.load(lease)
-            elif driver.state(lease) == "held" and not driver.arbiter.inspect().leases[lease].uses:
-                owner.use_begin(lease)
-    asked = len(driver.notes("revoke_asked"))
-    stowaway(driver, 0)
-    driver.until(
-        lambda: driver.state(head) != "queued" or driver.state(kept) == "revoking", limit_s=2.0
-    )
-    if driver.state(kept) == "revoking":
-        keeper.unload(kept)
-        asked += 1
-    for lease, owner in mine.items():
-        if driver.state(lease) == "loading":
-            owner.load(lease)
-    driver.until(lambda: driver.state(head) == "loading", limit_s=2.0)
-    assert len(driver.notes("revoke_asked")) == asked, "of those who passed nobody is asked"
-    assert any(driver.state(lease) == "held" for lease in mine)
 
 
 # -- residues
