@@ -4,6 +4,7 @@ crash. Real threads and files."""
 import asyncio
 import json
 from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.eventlog import replay as runner
 from vram_arbiter.arbiter.eventlog import writer as module
 from vram_arbiter.arbiter.eventlog.logfile import FOLDER, LogError, header_line
-from vram_arbiter.arbiter.eventlog.writer import Recorder, freezer
+from vram_arbiter.arbiter.eventlog.snapshot import to_plain
+from vram_arbiter.arbiter.eventlog.writer import Recorder
 from vram_arbiter.schemas import defaults as d
 
 PATIENCE_S = 60.0
@@ -38,7 +40,7 @@ class Recorded:
             "0.1",
             max_bytes=bounds.get("max_bytes", 8 * d.MIB),
             file_bytes=bounds.get("file_bytes", d.MIB),
-            freeze_engine=freezer(self.engine),
+            state=partial(to_plain, self.engine),
             told=self._told,
             clock=lambda: self.clock,
         )
