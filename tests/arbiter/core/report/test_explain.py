@@ -82,7 +82,7 @@ def test_why_follows_the_way_of_the_holder(driver: CoreDriver) -> None:
     det.use_begin(lease, "u2")
     driver.consumer("vlm").acquire(int(3.3 * GIB))
     first = why(driver, "vlm")
-    assert first["condition"] == "no_room"
+    assert (first["condition"], first["needed_bytes"]) == ("no_room", int(3.3 * GIB))
     assert first["blockers"] == [
         {
             "lease_id": lease,

@@ -266,6 +266,7 @@ def test_the_lease_of_a_silent_holder_is_given_up_and_its_bytes_measured(
     assert "not dead" in refused.message
     driver.advance(450.0)
     assert answer(order_of(ops, "release_dead", lease, "hangs since noon"))["state"] == "expired"
+    assert driver.notes("operator")[-1]["action"] == "release_dead"
     (lost,) = driver.pushes("lost", lease)
     assert lost["error"]["code"] == "lease_expired"
     assert lost["error"]["details"]["order"] == {"by": BY, "reason": "hangs since noon"}

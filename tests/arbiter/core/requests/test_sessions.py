@@ -227,6 +227,7 @@ def test_who_owns_bytes_of_a_gpu_and_who_is_connected() -> None:
     assert driver.arbiter.owners(first) == frozenset(), "nobody holds a lease"
     assert driver.arbiter.clients() == {det.process, watcher.process}
     lease = det.acquire(2 * GIB, gpu=first)
+    assert [driver.arbiter.concerns(one.client) for one in (det, watcher)] == [True, False]
     det.load(lease)
     assert (driver.arbiter.owners(first), driver.arbiter.owners(second)) == (
         {det.process},

@@ -42,6 +42,7 @@ def test_what_standby_looks_like(driver: CoreDriver) -> None:
     assert "ttl_left_s" not in view
     assert "position" not in view
     assert driver.notes("standby")[-1]["left_for"] == "policy"
+    assert driver.arbiter.inspect().leases[lease].story[-1][2] == "verified"
     driver.advance(600.0)
     assert driver.state(lease) == "standby", "nobody has to renew it"
     assert answer(det.renew((lease, det.token(lease))))["alive"] == [lease]
@@ -118,6 +119,13 @@ def test_it_waits_until_the_gpu_has_been_quiet(driver: CoreDriver) -> None:
     driver.advance(1.9)
     assert driver.state(lease) == "standby"
     driver.until(lambda: driver.state(lease) == "loading", limit_s=0.2)
+
+
+def test_the_end_of_the_quiet_needs_no_reading_to_be_noticed() -> None:
+    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
+    _, lease, policy, wanted = sent_away(driver, min_residency_s=20.0)
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=20.1)
 
 
 def test_who_came_back_unasked_has_no_claim_to_stay(driver: CoreDriver) -> None:
