@@ -22,6 +22,19 @@ def held(
     return person, lease
 
 
+def in_use(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
+    """A holder in the middle of its own use, and its lease."""
+    person, lease = held(driver, name, gib, **spec)
+    person.use_begin(lease)
+    return person, lease
+
+
+def give_back(driver: CoreDriver, person: Consumer, lease: LeaseId) -> None:
+    """Unload at a safe point, until the bytes are measured gone."""
+    person.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+
+
 def hidden_gpu(*, lists: bool = True, lag_s: float = 0.0) -> CoreDriver:
     """A GPU of 8 GiB as it is from the first reading on: with or without a list of processes, late
     by so much."""

@@ -1,7 +1,7 @@
 """The ladder: ask, ask again until heard, remind, deadline. Exact times, no sleep."""
 
 from tests.support.core_driver import CoreDriver
-from tests.support.scenes import held
+from tests.support.scenes import held, in_use
 from vram_arbiter.arbiter.core.events import ClientConnected
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ClientId
@@ -10,8 +10,7 @@ GIB = d.GIB
 
 
 def test_revoke_is_sent_again_until_acknowledged(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
+    det, lease = in_use(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     (first,) = driver.pushes("revoke")
     assert first == {
@@ -45,8 +44,7 @@ def test_revoke_is_sent_again_until_acknowledged(driver: CoreDriver) -> None:
 
 
 def test_a_waiter_that_is_patient_waits_past_the_deadline(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
+    det, lease = in_use(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     driver.advance(31.0)
     assert len(driver.notes("deadline_passed")) == 1
@@ -100,8 +98,7 @@ def test_death_while_asked_counts_as_leaving(driver: CoreDriver) -> None:
 
 def test_a_reminder_between_two_pushes_pushes_nothing() -> None:
     driver = CoreDriver(8 * GIB, settings={"revoke_resend_s": 0.3})
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
+    in_use(driver, "det", 5)
     driver.consumer("vlm").acquire(5 * GIB)
     driver.advance(2.05)
     assert len(driver.pushes("revoke")) == 7

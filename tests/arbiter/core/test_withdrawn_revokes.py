@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
-from tests.support.scenes import held, order
+from tests.support.scenes import give_back, held, in_use, order
 from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.schemas import defaults as d
@@ -20,8 +20,7 @@ def revoked_in_use(
     driver: CoreDriver, **spec: object
 ) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
     """A holder in use that was revoked, and the waiter that it was revoked for."""
-    holder, lease = held(driver, "train", 5, **spec)
-    holder.use_begin(lease)
+    holder, lease = in_use(driver, "train", 5, **spec)
     waiter = driver.consumer("waiter")
     wanted = waiter.acquire(5 * GIB)
     driver.until(lambda: driver.state(lease) == "revoking")
@@ -55,8 +54,7 @@ def test_a_revoke_is_withdrawn_with_its_waiter(driver: CoreDriver, how: str) -> 
 
 
 def test_a_revoke_is_withdrawn_where_the_wait_times_out(driver: CoreDriver) -> None:
-    holder, lease = held(driver, "train", 5)
-    holder.use_begin(lease)
+    _, lease = in_use(driver, "train", 5)
     driver.consumer("hasty").acquire(5 * GIB, wait_timeout_s=3.0)
     driver.until(lambda: driver.state(lease) == "revoking")
     driver.until(lambda: bool(driver.notes("denied")))
@@ -90,8 +88,7 @@ def test_an_unload_that_has_begun_completes(driver: CoreDriver) -> None:
     waiter.cancel(wanted)
     assert driver.state(lease) == "unloading"
     assert not driver.pushes("revoke_withdrawn")
-    holder.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, holder, lease)
 
 
 def test_another_waiter_takes_the_eviction_over(driver: CoreDriver) -> None:
@@ -142,8 +139,7 @@ def test_an_operators_order_stands(driver: CoreDriver) -> None:
     driver.advance(1.0)
     assert driver.state(lease) == "revoking"
     holder.use_end(lease)
-    holder.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, holder, lease)
 
 
 def test_a_revoke_for_pressure_ends_with_the_pressure(driver: CoreDriver) -> None:
@@ -182,8 +178,7 @@ def test_a_release_long_after_the_withdrawal_is_the_holders_own(driver: CoreDriv
     holder.use_begin(lease)
     holder.use_end(lease)
     driver.advance(60.0)
-    holder.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, holder, lease)
 
 
 def test_a_withdrawn_holder_keeps_its_place_among_residents() -> None:
@@ -208,8 +203,7 @@ def test_a_grant_names_only_evictions_that_were_asked_for_it(driver: CoreDriver)
     holder.use_end(lease)
     holder.unloading(lease)
     waiter.cancel(wanted)
-    holder.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, holder, lease)
     driver.advance(134.0)
     _, latecomer = held(driver, "late", 5)
     (granted,) = [note for note in driver.notes("granted") if note["lease_id"] == latecomer]
@@ -238,8 +232,7 @@ def test_a_waiter_that_leaves_before_its_grant_leaves_no_eviction_behind() -> No
 def test_an_operators_eviction_makes_no_switch(driver: CoreDriver) -> None:
     holder, lease = held(driver, "train", 5)
     order(driver, "evict", lease)
-    holder.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, holder, lease)
     _, later = held(driver, "later", 5)
     (granted,) = [note for note in driver.notes("granted") if note["lease_id"] == later]
     assert not granted["evicted"]
@@ -251,8 +244,7 @@ def test_of_two_gpus_emptied_for_one_waiter_each_holder_is_told_once() -> None:
     driver = CoreDriver(gpus=2)
     leases: list[LeaseId] = []
     for name, gpu in (("one", "0"), ("two", "1")):
-        holder, lease = held(driver, name, 5, gpu=gpu)
-        holder.use_begin(lease)
+        _, lease = in_use(driver, name, 5, gpu=gpu)
         leases.append(lease)
     waiter, later = driver.consumer("waiter"), driver.consumer("later")
     wanted = waiter.acquire(5 * GIB)
@@ -296,8 +288,7 @@ def test_a_lease_that_waits_again_does_not_inherit_its_earlier_evictions() -> No
     hung in its unload, was booked to the grant of the next one."""
     driver = CoreDriver()
     det, lease = held(driver, "det", 3, standby=True)
-    hanging, stuck = held(driver, "hanging", 3, priority=40)
-    hanging.use_begin(stuck)
+    hanging, stuck = in_use(driver, "hanging", 3, priority=40)
     evictor = driver.consumer("evictor")
     first = evictor.acquire(3 * GIB, priority=30)
     driver.until(lambda: driver.state(lease) == "revoking")

@@ -3,7 +3,7 @@
 import pytest
 
 from tests.support.core_driver import CoreDriver, refusal
-from tests.support.scenes import shown
+from tests.support.scenes import held, in_use, shown
 from vram_arbiter.arbiter.core.effects import Sample
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, LeaseId
@@ -190,10 +190,7 @@ def test_a_refusal_says_that_the_figure_was_learnt() -> None:
 
 def test_why_says_that_a_waiter_needs_more_than_it_declared() -> None:
     driver = CoreDriver(8 * GIB, settings={"footprints": {"w w-model": {"load_peak": [5 * GIB]}}})
-    det = driver.consumer("det")
-    lease = det.acquire(4 * GIB)
-    det.load(lease)
-    det.use_begin(lease)
+    in_use(driver, "det", 4)
     driver.consumer("w").acquire(2 * GIB)
     (why,) = driver.why("w")["leases"]
     assert why["expected_bytes"] == 5 * GIB
@@ -216,9 +213,7 @@ def test_a_lease_that_comes_back_after_a_restart_is_measured_on(driver: CoreDriv
 
 
 def test_the_residue_of_a_process_that_exits_teaches_nothing(driver: CoreDriver) -> None:
-    det = driver.consumer("det")
-    lease = det.acquire(2 * GIB)
-    det.load(lease)
+    det, lease = held(driver, "det", 2)
     driver.advance(1.5)
     det.release(lease, exiting=True)
     det.die()

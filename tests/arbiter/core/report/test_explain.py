@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from tests.support.core_driver import CoreDriver
-from tests.support.scenes import held, shown, why
+from tests.support.scenes import held, in_use, shown, why
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.events import Asked
 from vram_arbiter.schemas import defaults as d
@@ -16,8 +16,7 @@ GIB, MIB = d.GIB, d.MIB
 
 
 def test_status_shows_holders_first_then_the_queue_in_order(driver: CoreDriver) -> None:
-    busy, lease = held(driver, "busy", 5)
-    busy.use_begin(lease)
+    busy, lease = in_use(driver, "busy", 5)
     driver.consumer("late").acquire(5 * GIB)
     driver.consumer("urgent").acquire(5 * GIB, priority=90)
     driver.device.names[ProcessKey(9, 9)] = "browser"
@@ -77,8 +76,7 @@ def test_why_of_a_resident_lease_says_what_it_is_doing(driver: CoreDriver) -> No
 
 def test_why_follows_the_way_of_the_holder(driver: CoreDriver) -> None:
     driver.device.lag_s = 0.5
-    det, lease = held(driver, "det", 5.3, min_residency_s=2.0)
-    det.use_begin(lease)
+    det, lease = in_use(driver, "det", 5.3, min_residency_s=2.0)
     det.use_begin(lease, "u2")
     driver.consumer("vlm").acquire(int(3.3 * GIB))
     first = why(driver, "vlm")
@@ -122,10 +120,8 @@ def test_why_follows_the_way_of_the_holder(driver: CoreDriver) -> None:
 
 def test_why_says_who_is_pinned_idle_or_of_higher_priority() -> None:
     driver = CoreDriver(10 * GIB)
-    busy, busy_lease = held(driver, "busy", 3, priority=90)
-    busy.use_begin(busy_lease)
-    even, even_lease = held(driver, "even", 1)
-    even.use_begin(even_lease)
+    in_use(driver, "busy", 3, priority=90)
+    in_use(driver, "even", 1)
     held(driver, "calm", 1)
     driver.consumer("w").acquire(8 * GIB)
     keeper, keeper_lease = held(driver, "keeper", 1, residue_bytes=450 * MIB, evictable=False)

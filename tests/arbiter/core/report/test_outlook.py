@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import CoreDriver
-from tests.support.scenes import held
+from tests.support.scenes import held, in_use
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ProcessKey
 
@@ -40,8 +40,7 @@ def test_it_asks_when_the_minimum_residency_ends(driver: CoreDriver) -> None:
 
 
 def test_it_asks_when_the_waiter_has_aged_enough(driver: CoreDriver) -> None:
-    holder, lease = held(driver, "important", 6, priority=52)
-    holder.use_begin(lease)
+    _, lease = in_use(driver, "important", 6, priority=52)
     driver.consumer("w").acquire(4 * GIB, priority=50)
     step = only(driver)
     assert step["in_s"] == pytest.approx(2 * d.AGEING_S_PER_POINT, abs=0.1)
@@ -97,8 +96,7 @@ def test_whoever_may_be_asked_already_waits_for_a_measurement_first(driver: Core
 
 
 def test_a_holder_on_its_way_out(driver: CoreDriver) -> None:
-    holder, lease = held(driver, "holder", 6)
-    holder.use_begin(lease)
+    holder, lease = in_use(driver, "holder", 6)
     driver.consumer("w").acquire(4 * GIB)
     step = only(driver)
     assert step["action"] == "deadline"
@@ -174,8 +172,7 @@ def test_after_a_restart_the_latest_holder_gives_the_bound(driver: CoreDriver) -
 
 
 def test_behind_others_only_its_own_end_is_planned(driver: CoreDriver) -> None:
-    holder, lease = held(driver, "holder", 6)
-    holder.use_begin(lease)
+    in_use(driver, "holder", 6)
     driver.consumer("head").acquire(4 * GIB)
     driver.consumer("w").acquire(5 * GIB, wait_timeout_s=12.0)
     step = only(driver)
@@ -216,8 +213,7 @@ def test_the_estimate_behind_others_counts_their_loads() -> None:
     fits once those ahead of it have left was too."""
     learnt = {"detector": {"drain_s": 1.0, "unload_s": 0.5, "verify_s": 0.5}, **LOADS}
     driver = CoreDriver(8 * GIB, settings={"learnt": learnt})
-    detector, lease = held(driver, "detector", 7)
-    detector.use_begin(lease)
+    _, lease = in_use(driver, "detector", 7)
     driver.consumer("head").acquire(4 * GIB)
     driver.consumer("second").acquire(2 * GIB)
     driver.consumer("third").acquire(3 * GIB)

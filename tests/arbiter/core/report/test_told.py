@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import START_S, CoreDriver, answer, as_wire, refusal
-from tests.support.scenes import held, order, sent_away, shown
+from tests.support.scenes import give_back, held, in_use, order, sent_away, shown
 from vram_arbiter.arbiter.core.events import ProbeFailed
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.schemas import defaults as d
@@ -251,8 +251,7 @@ def test_an_adopted_lease_says_where_it_comes_from(driver: CoreDriver) -> None:
 
 
 def test_the_head_says_what_keeps_the_engine_from_asking(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
+    in_use(driver, "det", 5)
     waiting = driver.consumer("vlm").acquire(5 * GIB, priority=d.PRIORITY - 10)
     assert core_lease(driver, waiting).request.reason == Wait.NO_VICTIM
 
@@ -260,8 +259,7 @@ def test_the_head_says_what_keeps_the_engine_from_asking(driver: CoreDriver) -> 
 def test_nobody_is_asked_while_a_dead_process_may_still_make_room(driver: CoreDriver) -> None:
     driver.device.lag_s = 0.5
     gone, left = held(driver, "gone", 3, residue_bytes=450 * MIB)
-    gone.unload(left)
-    driver.until(lambda: driver.state(left) == "over")
+    give_back(driver, gone, left)
     _, lease = held(driver, "det", 5)
     gone.die()
     waiting = driver.consumer("vlm").acquire(3 * GIB)

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.scenes import held, shown
+from tests.support.scenes import give_back, held, in_use, shown
 from vram_arbiter.arbiter.core.effects import Effect, Note, Signal
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
@@ -32,8 +32,7 @@ def noted(effects: list[Effect]) -> dict[str, Any]:
 
 # -- evict
 def test_an_evicted_holder_in_use_finishes_first(driver: CoreDriver, ops: Consumer) -> None:
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
+    det, lease = in_use(driver, "det", 5)
     effects = order_of(ops, "evict", "det", "maintenance")
     assert answer(effects)["state"] == "revoking"
     assert noted(effects) | {
@@ -51,8 +50,7 @@ def test_an_evicted_holder_in_use_finishes_first(driver: CoreDriver, ops: Consum
     early = refusal(other.use_begin(lease, token=token))
     assert (early.code, early.details["revoked"]) == ("lease_revoking", order)
     det.use_end(lease)
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, det, lease)
     late = refusal(other.use_begin(lease, token=token))
     assert (late.code, late.details["state"], late.details["revoked"]) == (
         "bad_state",
@@ -75,8 +73,7 @@ def test_a_holder_that_leaves_for_a_waiter_hears_of_the_operator(
 ) -> None:
     """`vramctl run` lets a waiter of its own priority wait, and ends its program for an
     operator."""
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
+    det, lease = in_use(driver, "det", 5)
     driver.consumer("vlm").acquire(5 * GIB)
     driver.until(lambda: bool(driver.pushes("revoke", lease)))
     det.ack(lease, None)
@@ -93,8 +90,7 @@ def test_a_holder_that_leaves_for_a_waiter_hears_of_the_operator(
 
 def test_the_push_of_a_repeated_evict_puts_off_no_other(driver: CoreDriver, ops: Consumer) -> None:
     """An operator who repeats an evict all the time would keep the ladder from its own pushes."""
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
+    _, lease = in_use(driver, "det", 5)
     order_of(ops, "evict", lease)
     driver.advance(0.2)
     order_of(ops, "evict", lease)
@@ -278,8 +274,7 @@ def test_the_lease_of_a_silent_holder_is_given_up_and_its_bytes_measured(
 
 
 def test_a_lease_in_use_is_never_given_up(driver: CoreDriver, ops: Consumer) -> None:
-    det, lease = held(driver, "det", 5, ttl_s=600.0)
-    det.use_begin(lease)
+    _, lease = in_use(driver, "det", 5, ttl_s=600.0)
     driver.advance(450.0)
     assert "in use" in refusal(order_of(ops, "release_dead", lease)).message
 
@@ -383,8 +378,7 @@ def test_a_stuck_holder_is_told_to_end_and_killed_when_asked_twice(
     driver: CoreDriver, ops: Consumer
 ) -> None:
     """Its own use may be what is stuck: it protects it from an eviction, not from a person."""
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
+    det, lease = in_use(driver, "det", 5)
     for signal in ("term", "kill", "kill"):
         effects = order_of(ops, "kill", "det", "it hangs")
         assert signals(effects) == [(det.process, signal)]

@@ -4,6 +4,7 @@ nobody is granted before."""
 from typing import Any
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.scenes import give_back
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.events import (
     Asked,
@@ -72,8 +73,7 @@ def test_re_attaching_to_a_daemon_that_did_not_restart_only_moves_the_connection
     assert answer(det.reattach(lease, token, uses=["late"]))["leases"][0]["lease"]["uses"] == 0, (
         "it unloads"
     )
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, det, lease)
     (gone,) = answer(det.reattach(lease, token))["leases"]
     assert gone["error"]["code"] == "bad_state"
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import CoreDriver, answer, refusal
-from tests.support.scenes import shown
+from tests.support.scenes import held, shown
 from vram_arbiter.arbiter.core.effects import JournalPut, Note, Push, Reply, Sample
 from vram_arbiter.arbiter.core.events import Asked
 from vram_arbiter.arbiter.core.model.records import LeaseRecord
@@ -241,9 +241,7 @@ def test_no_new_use_once_the_holder_was_asked(driver: CoreDriver) -> None:
 
 # -- renew
 def test_renewing_keeps_alive_and_never_resurrects(driver: CoreDriver) -> None:
-    det = driver.consumer("det")
-    lease = det.acquire(5 * GIB, ttl_s=10.0, min_residency_s=100.0)
-    det.load(lease)
+    det, lease = held(driver, "det", 5, ttl_s=10.0, min_residency_s=100.0)
     queued = det.acquire(5 * GIB)
     token = det.token(lease)
     driver.advance(9.0)

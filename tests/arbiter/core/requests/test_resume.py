@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from tests.support.core_driver import CoreDriver, answer
-from tests.support.scenes import held
+from tests.support.scenes import held, in_use
 from vram_arbiter.arbiter.core.effects import Note, Sample
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessDied, Resumed
 from vram_arbiter.schemas import defaults as d
@@ -109,8 +109,7 @@ def test_a_recovery_without_a_journal_waits_anew_too(driver: CoreDriver) -> None
 
 
 def test_waiters_and_leases_on_their_way_out_keep_their_place(driver: CoreDriver) -> None:
-    holder, lease = held(driver, "a", 5, ttl_s=3600.0)
-    holder.use_begin(lease)
+    holder, lease = in_use(driver, "a", 5, ttl_s=3600.0)
     waiter = driver.consumer("b").acquire(5 * GIB, wait_timeout_s=20.0)
     driver.until(lambda: driver.state(lease) == "revoking")
     effects = driver.post(Resumed(NIGHT_S))

@@ -1,6 +1,7 @@
 """Connections that come and go, deaths, and a journal that fails."""
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.scenes import give_back, held
 from vram_arbiter.arbiter.core.effects import Note, Push, Refuse
 from vram_arbiter.arbiter.core.events import (
     ClientConnected,
@@ -111,12 +112,10 @@ def test_a_death_ends_leases_waits_and_uses_and_its_bytes_are_measured_away() ->
 
 
 def test_a_death_during_verification_needs_no_residue_any_more(driver: CoreDriver) -> None:
-    det = driver.consumer("det")
-    held = det.acquire(5 * GIB, residue_bytes=1 * GIB)
-    det.load(held)
-    det.unload(held)
+    det, lease = held(driver, "det", 5, residue_bytes=1 * GIB)
+    det.unload(lease)
     det.die()
-    driver.until(lambda: driver.state(held) == "over")
+    driver.until(lambda: driver.state(lease) == "over")
     assert driver.gpu()["charged_bytes"] == 0
     assert driver.journal == {}
 
@@ -125,8 +124,7 @@ def test_the_residue_of_a_dead_process_is_measured_away_too(driver: CoreDriver) 
     det, big = driver.consumer("det"), driver.consumer("big")
     held = det.acquire(5 * GIB, residue_bytes=1 * GIB)
     det.load(held)
-    det.unload(held)
-    driver.until(lambda: driver.state(held) == "over")
+    give_back(driver, det, held)
     assert driver.gpu()["charged_bytes"] == 1 * GIB
     assert list(driver.journal) == [f"residue:{det.process}:GPU-0"]
     waiting = big.acquire(7 * GIB)
@@ -155,11 +153,8 @@ def test_a_grant_that_cannot_be_written_is_taken_back(driver: CoreDriver) -> Non
 
 def test_a_grant_taken_back_leaves_the_residue_of_its_process_charged(driver: CoreDriver) -> None:
     """Regression: with the grant the ledger forgot the context that the process had all along."""
-    det = driver.consumer("det")
-    lease = det.acquire(5 * GIB, residue_bytes=1 * GIB)
-    det.load(lease)
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    det, lease = held(driver, "det", 5, residue_bytes=1 * GIB)
+    give_back(driver, det, lease)
     driver.restart()
     det.connect()
     driver.until(lambda: bool(driver.notes("serving")), limit_s=30.0)
@@ -205,12 +200,10 @@ def test_a_loading_holder_is_not_undone_by_a_later_record(driver: CoreDriver) ->
 
 
 def test_a_release_is_told_though_its_record_fails(driver: CoreDriver) -> None:
-    det = driver.consumer("det")
-    held = det.acquire(5 * GIB)
-    det.load(held)
+    det, lease = held(driver, "det", 5)
     driver.journal_failing = "disk full"
     det.hold(0)
-    answer(det.release(held))
+    answer(det.release(lease))
     assert driver.notes("released")
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.engine_state import state_of
-from tests.support.scenes import held
+from tests.support.scenes import give_back, held
 from vram_arbiter.arbiter.core.scheduling.victims import Choice
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
@@ -65,8 +65,7 @@ def come_and_go(driver: CoreDriver, person: Consumer, pause_s: float) -> None:
     driver.until(lambda: driver.state(lease) == "loading")
     driver.advance(10.0)
     person.load(lease)
-    person.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, person, lease)
     driver.advance(pause_s)
 
 

@@ -4,7 +4,7 @@ pressure, several GPUs."""
 import pytest
 
 from tests.support.core_driver import CoreDriver, answer
-from tests.support.scenes import held
+from tests.support.scenes import give_back, held, in_use
 from vram_arbiter.arbiter.core.effects import Sample
 from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.schemas import defaults as d
@@ -27,8 +27,7 @@ def test_a_higher_priority_passes_and_equals_keep_their_order(driver: CoreDriver
 
 
 def test_a_small_one_passes_the_head_if_it_cannot_delay_it(driver: CoreDriver) -> None:
-    busy, busy_lease = held(driver, "busy", 4)
-    busy.use_begin(busy_lease)
+    busy, busy_lease = in_use(driver, "busy", 4)
     head = driver.consumer("head").acquire(5 * GIB)
     assert driver.state(busy_lease) == "revoking"
     small = driver.consumer("small")
@@ -47,8 +46,7 @@ def test_a_small_one_passes_the_head_if_it_cannot_delay_it(driver: CoreDriver) -
 
 def test_nobody_passes_an_exclusive_head_or_when_its_room_is_about_to_come() -> None:
     driver = CoreDriver(8 * GIB)
-    busy, busy_lease = held(driver, "busy", 4)
-    busy.use_begin(busy_lease)
+    in_use(driver, "busy", 4)
     alone = driver.consumer("alone")
     head = alone.acquire(1 * GIB, exclusive=True)
     small = driver.consumer("small").acquire(1 * GIB)
@@ -76,8 +74,7 @@ def test_while_the_head_s_victim_unloads_nobody_starts_a_load_in_between() -> No
 
 
 def test_an_exclusive_waiter_never_passes(driver: CoreDriver) -> None:
-    busy, busy_lease = held(driver, "busy", 4, priority=90)
-    busy.use_begin(busy_lease)
+    in_use(driver, "busy", 4, priority=90)
     head = driver.consumer("head").acquire(5 * GIB)
     alone = driver.consumer("alone").acquire(1 * GIB, exclusive=True)
     third = driver.consumer("third").acquire(2 * GIB)
@@ -109,8 +106,7 @@ def test_the_debt_of_an_exclusive_holder_keeps_the_gpu_to_itself(end: str) -> No
 
 def test_residues_may_stay_beside_an_exclusive_lease(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, det, lease)
     alone = driver.consumer("alone").acquire(7 * GIB, exclusive=True)
     driver.advance(0.01)
     assert driver.state(alone) == "loading"
@@ -186,8 +182,7 @@ def test_a_load_peak_that_is_not_back_yet_carries_no_grant() -> None:
 def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder(driver: CoreDriver) -> None:
     calm, calm_lease = held(driver, "calm", 2)
     _, other_lease = held(driver, "other", 4)
-    busy, busy_lease = held(driver, "busy", 1)
-    busy.use_begin(busy_lease)
+    _, busy_lease = in_use(driver, "busy", 1)
     driver.device.set(STRANGER, 2 * GIB, driver.now)
     waiter = driver.consumer("w")
     driver.until(lambda: bool(driver.notes("pressure")), limit_s=2.0)
@@ -209,8 +204,7 @@ def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder(driver: CoreDri
 
 def test_pressure_that_cannot_be_covered_asks_every_idle_holder(driver: CoreDriver) -> None:
     _, small = held(driver, "small", 1)
-    busy, busy_lease = held(driver, "busy", 6)
-    busy.use_begin(busy_lease)
+    _, busy_lease = in_use(driver, "busy", 6)
     driver.device.set(STRANGER, 3 * GIB, driver.now)
     driver.until(lambda: driver.state(small) == "revoking", limit_s=2.0)
     assert driver.state(busy_lease) == "held"
@@ -218,8 +212,7 @@ def test_pressure_that_cannot_be_covered_asks_every_idle_holder(driver: CoreDriv
 
 
 def test_a_holder_above_its_charge_is_pressure_not_a_stowaway(driver: CoreDriver) -> None:
-    liar, lease = held(driver, "liar", 3)
-    liar.use_begin(lease)
+    liar, _ = in_use(driver, "liar", 3)
     _, idle = held(driver, "idle", 4, min_residency_s=5.0)
     liar.hold(5 * GIB)
     driver.until(lambda: bool(driver.notes("pressure")), limit_s=2.0)
@@ -231,8 +224,7 @@ def test_a_holder_above_its_charge_is_pressure_not_a_stowaway(driver: CoreDriver
 
 
 def test_ready_with_more_than_granted_is_pressure_and_no_violation(driver: CoreDriver) -> None:
-    a, first = held(driver, "a", 4)
-    a.use_begin(first)
+    a, first = in_use(driver, "a", 4)
     b = driver.consumer("b")
     second = b.acquire(3 * GIB)
     driver.until(lambda: driver.state(second) == "loading")
@@ -262,8 +254,7 @@ def test_any_waits_for_room_that_comes_on_another_gpu() -> None:
 def test_the_dearer_gpu_is_emptied_if_the_cheaper_one_is_not_its_turn() -> None:
     driver = CoreDriver(8 * GIB, gpus=2)
     _, dear = held(driver, "dear", 5, priority=80, gpu="0")
-    cheap, cheap_lease = held(driver, "cheap", 5, priority=20, gpu="1")
-    cheap.use_begin(cheap_lease)
+    in_use(driver, "cheap", 5, priority=20, gpu="1")
     driver.consumer("first").acquire(5 * GIB, gpu="1", priority=60)
     waiter = driver.consumer("w").acquire(5 * GIB)
     assert driver.state(dear) == "revoking"

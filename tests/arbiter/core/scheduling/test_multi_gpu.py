@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.scenes import held, place
+from tests.support.scenes import give_back, held, in_use, place
 from vram_arbiter.arbiter.core.events import ProcessDied
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, LeaseId
@@ -79,8 +79,7 @@ def test_exclusive_means_alone_on_its_gpu(driver: CoreDriver) -> None:
 
 # -- queues
 def test_a_waiter_for_one_gpu_does_not_hold_up_another(driver: CoreDriver) -> None:
-    busy, lease = held(driver, "busy", 6, gpu="0")
-    busy.use_begin(lease)
+    in_use(driver, "busy", 6, gpu="0")
     waits = driver.consumer("w").acquire(6 * GIB, gpu="0", priority=90)
     _, free = held(driver, "free", 6, gpu="1")
     assert (driver.state(waits), place(driver, free)) == ("queued", ONE)
@@ -250,8 +249,7 @@ def test_a_waiter_for_any_gpu_ages_on_all_of_them(driver: CoreDriver) -> None:
     to that."""
     leases = []
     for index, priority in ((0, 56), (1, 54)):
-        person, lease = held(driver, f"busy{index}", 6, gpu=str(index), priority=priority)
-        person.use_begin(lease)
+        _, lease = in_use(driver, f"busy{index}", 6, gpu=str(index), priority=priority)
         leases.append(lease)
     waiter = driver.consumer("w").acquire(6 * GIB, priority=50)
     step_s = driver.settings.ageing_s_per_point
@@ -279,8 +277,7 @@ def on_standby(driver: CoreDriver, selector: str) -> tuple[Consumer, LeaseId]:
     policy.use_begin(wanted)
     driver.advance(1.0)
     assert driver.state(lease) == "standby"
-    filler.unload(fills)
-    driver.until(lambda: driver.state(fills) == "over")
+    give_back(driver, filler, fills)
     return det, lease
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.scenes import give_back
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
@@ -143,8 +144,7 @@ def test_the_ageing_bound_holds_against_those_who_passed() -> None:
 def test_small_ones_pass_a_head_that_waits_for_a_context(driver: CoreDriver) -> None:
     """7.4 GiB do not fit beside the context of a process that lives on; when it ends, both do."""
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
-    old.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, old, lease)
     head = driver.consumer("head").acquire(int(7.4 * GIB))
     too_big = driver.consumer("big").acquire(GIB)
     held_after_peak(driver, "small", 0.2)
@@ -156,8 +156,7 @@ def test_small_ones_pass_a_head_that_waits_for_a_context(driver: CoreDriver) -> 
 def test_while_a_dead_process_s_context_is_measured_nobody_passes(driver: CoreDriver) -> None:
     driver.device.lag_s = 1.0
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
-    old.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, old, lease)
     head = driver.consumer("head").acquire(int(7.4 * GIB))
     old.die()
     small = driver.consumer("small").acquire(200 * MIB)
@@ -172,8 +171,7 @@ def learned(driver: CoreDriver, gib: float) -> Consumer:
     lease = person.acquire(3 * GIB)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=3.0)
     person.load(lease, int(gib * GIB))
-    person.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, person, lease)
     person.die()
     driver.advance(3.0)
     return driver.consumer("greedy")
@@ -184,8 +182,7 @@ def test_what_was_learned_never_waits_for_bytes_that_may_stay_for_good(driver: C
     process, and the request of that very process waited behind it: neither was ever granted."""
     greedy = learned(driver, 7.4)
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
-    old.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, old, lease)
     head, behind = greedy.acquire(3 * GIB), old.acquire(2 * GIB)
     driver.until(lambda: driver.state(head) == "loading", limit_s=2.0)
     charged = driver.gpu()["charged_bytes"]
@@ -209,8 +206,7 @@ def test_what_holders_will_give_back_is_waited_for_at_the_learned_bytes(driver: 
 def test_nothing_is_settled_below_the_declaration(driver: CoreDriver) -> None:
     greedy = learned(driver, 7.4)
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
-    old.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, old, lease)
     head = greedy.acquire(int(7.3 * GIB))
     driver.advance(2.0)
     assert (driver.state(head), driver.view(head)["charge_bytes"]) == ("queued", int(7.4 * GIB))

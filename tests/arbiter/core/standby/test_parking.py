@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.scenes import held, shown
+from tests.support.scenes import give_back, held, shown
 from vram_arbiter.arbiter.core.ledger import HostRam
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId
@@ -156,8 +156,7 @@ def test_a_load_from_ram_that_fails_may_stay_parked_or_end() -> None:
     """cuda-checkpoint#44: a restore that fails must not be the end of everything."""
     driver = driver_with()
     vlm, lease, policy, wanted = parked(driver)
-    policy.unload(wanted)
-    driver.until(lambda: driver.state(wanted) == "over")
+    give_back(driver, policy, wanted)
     vlm.reacquire(lease)
     vlm.release(lease, parked=True)
     driver.until(lambda: driver.state(lease) == "parked", limit_s=30.0)

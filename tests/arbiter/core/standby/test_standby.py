@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.scenes import held, revoked, sent_away, shown
+from tests.support.scenes import give_back, held, in_use, revoked, sent_away, shown
 from vram_arbiter.arbiter.core.events import ProcessDied
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
@@ -91,8 +91,7 @@ def test_it_asks_nobody_to_leave(driver: CoreDriver) -> None:
 
 def test_it_never_delays_a_waiter(driver: CoreDriver) -> None:
     _, lease, policy, wanted = sent_away(driver)
-    busy, small = held(driver, "busy", 1)
-    busy.use_begin(small)
+    in_use(driver, "busy", 1)
     policy.use_begin(wanted)
     big = driver.consumer("big").acquire(7 * GIB)
     policy.use_end(wanted)
@@ -167,8 +166,7 @@ def all_away(
         person.unload(lease)
         driver.advance(0.2)
     boss.load(all_of_it)
-    boss.unload(all_of_it)
-    driver.until(lambda: driver.state(all_of_it) == "over")
+    give_back(driver, boss, all_of_it)
     return people
 
 
@@ -234,8 +232,7 @@ def test_several_that_do_not_fit_keep_their_turns(driver: CoreDriver) -> None:
 
 def test_who_leaves_unasked_does_not_want_back(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, standby=True)
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, det, lease)
     assert driver.journal == {}
 
 

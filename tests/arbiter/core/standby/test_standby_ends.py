@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.scenes import held, order, revoked, sent_away
+from tests.support.scenes import give_back, held, order, revoked, sent_away
 from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
@@ -67,8 +67,7 @@ def test_it_ends_with_its_process(driver: CoreDriver) -> None:
 def test_whom_an_operator_evicts_does_not_come_back(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, standby=True)
     order(driver, "evict", lease)
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, det, lease)
     assert driver.journal == {}
 
 
@@ -106,8 +105,7 @@ def test_an_operators_eviction_outlives_a_restart(driver: CoreDriver) -> None:
     driver.restart()
     det.connect()
     det.reattach(lease, token)
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, det, lease)
     assert f"lease:{lease}" not in driver.journal
 
 

@@ -208,9 +208,7 @@ def test_a_lost_journal_does_not_lose_it_either(driver: CoreDriver) -> None:
 
 def test_a_held_lease_that_the_journal_lost_still_goes_on_standby(driver: CoreDriver) -> None:
     """The feature watches what a holder brings back, not only what it saw asked for."""
-    det = driver.consumer("det")
-    lease = det.acquire(5 * GIB, standby=True)
-    det.load(lease)
+    det, lease = held(driver, "det", 5, standby=True)
     token = det.token(lease)
     driver.restart(keep_journal=False)
     det.connect()

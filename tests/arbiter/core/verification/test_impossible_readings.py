@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import CoreDriver
+from tests.support.scenes import held
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ProcessKey
@@ -64,9 +65,7 @@ def test_a_first_reading_that_cannot_be_true_is_no_measure_for_later_ones() -> N
 
 
 def test_bytes_are_not_measured_gone_by_an_impossible_reading(driver: CoreDriver) -> None:
-    det = driver.consumer("det")
-    lease = det.acquire(5 * GIB)
-    det.load(lease)
+    det, _ = held(driver, "det", 5)
     driver.device.lies = {"used_bytes": -(1 << 40), "processes": ()}
     det.die()
     driver.advance(2.0)
@@ -78,9 +77,7 @@ def test_bytes_are_not_measured_gone_by_an_impossible_reading(driver: CoreDriver
 
 def test_an_empty_gpu_that_cannot_be_true_accounts_for_no_holder_after_a_restart() -> None:
     driver = CoreDriver(8 * GIB)
-    det = driver.consumer("det")
-    lease = det.acquire(5 * GIB)
-    det.load(lease)
+    held(driver, "det", 5)
     driver.device.lies = {"used_bytes": -1}
     driver.restart()
     driver.advance(2.0)

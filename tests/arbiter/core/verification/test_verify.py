@@ -6,7 +6,7 @@ import itertools
 import pytest
 
 from tests.support.core_driver import READING_S, CoreDriver
-from tests.support.scenes import held
+from tests.support.scenes import give_back, held
 from vram_arbiter.arbiter.core.effects import Sample
 from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed, Tick
 from vram_arbiter.schemas import defaults as d
@@ -437,8 +437,7 @@ def test_the_end_of_a_ttl_and_an_unload_do_not_block_each_other(
 def test_the_residue_of_a_process_that_left_unseen_is_forgotten(driver: CoreDriver) -> None:
     """A process that said bye and is neither connected nor on the GPU any more keeps nothing."""
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, det, lease)
     det.hold(0)
     driver.advance(2.0)
     assert driver.gpu()["charged_bytes"] == 450 * MIB, "connected: it may use its context again"
@@ -473,10 +472,7 @@ def test_a_residue_of_a_process_listed_without_bytes_stays_until_a_reading_shows
 
 
 def test_two_debts_of_one_dead_process_are_measured_together(driver: CoreDriver) -> None:
-    det = driver.consumer("det")
-    first = det.acquire(2 * GIB)
-    det.load(first)
-    driver.advance(0.01)
+    det, _ = held(driver, "det", 2)
     second = det.acquire(3 * GIB)
     det.hold(5 * GIB)
     det.ready(second)

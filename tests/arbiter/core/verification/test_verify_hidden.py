@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
-from tests.support.scenes import held, hidden_gpu
+from tests.support.scenes import give_back, held, hidden_gpu
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
@@ -290,8 +290,7 @@ def test_what_a_process_keeps_is_restored_beside_its_lease() -> None:
     same, which lie within their leases."""
     driver = hidden_gpu(lists=False)
     small, first = held(driver, "small", 0.5, residue_bytes=450 * MIB)
-    small.unload(first)
-    driver.until(lambda: driver.state(first) == "over")
+    give_back(driver, small, first)
     small.hold(450 * MIB)
     _, second = held(driver, "small", 0.5, small)
     big, lease = held(driver, "big", 7)
