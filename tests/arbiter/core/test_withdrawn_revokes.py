@@ -283,6 +283,19 @@ def test_on_a_gpu_that_grants_nothing_the_next_waiter_takes_over(driver: CoreDri
     assert driver.pushes("revoke", lease)[-1]["wanted_by"] == "later"
 
 
+def test_on_a_gpu_that_grants_nothing_a_waiter_placed_elsewhere_takes_nothing_over() -> None:
+    driver = CoreDriver(gpus=2)
+    _, first = in_use(driver, "one", 5, gpu="0", priority=10)
+    _, second = in_use(driver, "two", 5, gpu="1", priority=20)
+    driver.consumer("anywhere").acquire(5 * GIB)
+    waiter = driver.consumer("waiter")
+    wanted = waiter.acquire(5 * GIB, gpu="1")
+    driver.until(lambda: driver.state(second) == "revoking")
+    driver.consumer("ops").order("drain")
+    waiter.cancel(wanted)
+    assert (driver.state(first), driver.state(second)) == ("revoking", "held")
+
+
 def test_a_lease_that_waits_again_does_not_inherit_its_earlier_evictions() -> None:
     """A lease on standby waits under one id again and again. What was revoked for one wait, and
     hung in its unload, was booked to the grant of the next one."""

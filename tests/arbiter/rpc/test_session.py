@@ -148,14 +148,16 @@ def make_bench(**changes: Any) -> Bench:
         "process_share": 1.0, "rate_per_client_per_s": 100,
         "rate_per_process_per_s": 1000, "subscribers_max": 1, "operators_gid": None,
     }  # fmt: skip
-    bench = Bench()
+    session_bench = Bench()
     settings = SessionSettings(**{**values, **changes})
-    bench.table = SessionTable(settings, bench, bench.history, bench, lambda: bench.now)
-    return bench
+    session_bench.table = SessionTable(
+        settings, session_bench, session_bench.history, session_bench, lambda: session_bench.now
+    )
+    return session_bench
 
 
 @pytest.fixture
-def bench() -> Bench:
+def session_bench() -> Bench:
     return make_bench()
 
 
@@ -164,65 +166,67 @@ def code(reply: Mapping[str, Any]) -> str:
     return str(reply["error"]["code"])
 
 
-def acquire(bench: Bench) -> None:
-    bench.ask("acquire", nonce="n", spec={"consumer": "c", "model_id": "m", "footprint": FOOTPRINT})
+def acquire(session_bench: Bench) -> None:
+    session_bench.ask(
+        "acquire", nonce="n", spec={"consumer": "c", "model_id": "m", "footprint": FOOTPRINT}
+    )
 
 
-def test_hello_is_welcomed_and_the_core_hears_the_kernels_word(bench: Bench) -> None:
-    reply = bench.hello()
+def test_hello_is_welcomed_and_the_core_hears_the_kernels_word(session_bench: Bench) -> None:
+    reply = session_bench.hello()
     assert reply == {
         "re": 1, "epoch": 3, "ok": True, "version": d.WIRE_VERSION, "boot_id": "boot",
         "server": "test", "role": "client",
         "heartbeat_s": 2.0, "grace_s": 5.0,
     }  # fmt: skip
-    assert bench.events == [
-        ev.ClientConnected(bench.client(), ME.process, os.getuid(), "n", "i-61")
+    assert session_bench.events == [
+        ev.ClientConnected(session_bench.client(), ME.process, os.getuid(), "n", "i-61")
     ]
-    assert bench.watched == [ME.process]
-    assert bench.connections[b"a"].admitted, "the time limit for hellos ends"
+    assert session_bench.watched == [ME.process]
+    assert session_bench.connections[b"a"].admitted, "the time limit for hellos ends"
 
 
-def test_nothing_goes_before_hello(bench: Bench) -> None:
+def test_nothing_goes_before_hello(session_bench: Bench) -> None:
     for op in ("ping", "status", "bye"):
-        assert code(bench.ask(op)) == "unknown_session"
-    assert bench.events == []
+        assert code(session_bench.ask(op)) == "unknown_session"
+    assert session_bench.events == []
 
 
-def test_another_version_is_refused(bench: Bench) -> None:
+def test_another_version_is_refused(session_bench: Bench) -> None:
     for theirs, who in ((1, "client"), (d.WIRE_VERSION + 1, "arbiter")):
-        reply = bench.hello(version=theirs)
+        reply = session_bench.hello(version=theirs)
         assert code(reply) == "version_mismatch"
         assert reply["error"]["details"] == {"server": d.WIRE_VERSION, "client": theirs}
         assert f"upgrade the {who}" in reply["error"]["hint"]
-    assert len(bench.table) == 0
+    assert len(session_bench.table) == 0
 
 
-def test_a_peer_that_cannot_be_seen_is_refused(bench: Bench) -> None:
+def test_a_peer_that_cannot_be_seen_is_refused(session_bench: Bench) -> None:
     """The kernel says pid 0 of a process of another pid namespace: its death would be heard by
     nothing."""
-    reply = bench.hello(peer=Peer(ProcessKey(0, 0), 1000, 1000, -1))
+    reply = session_bench.hello(peer=Peer(ProcessKey(0, 0), 1000, 1000, -1))
     assert code(reply) == "not_permitted"
     assert "--pid=host" in reply["error"]["hint"]
-    assert bench.events == []
-    assert not bench.connections[b"a"].admitted
+    assert session_bench.events == []
+    assert not session_bench.connections[b"a"].admitted
 
 
-def test_hello_again_is_idempotent_but_not_under_another_name(bench: Bench) -> None:
-    bench.hello()
-    assert bench.hello()["ok"]
-    assert code(bench.hello(name="other")) == "bad_state"
-    assert len(bench.events) == 1
+def test_hello_again_is_idempotent_but_not_under_another_name(session_bench: Bench) -> None:
+    session_bench.hello()
+    assert session_bench.hello()["ok"]
+    assert code(session_bench.hello(name="other")) == "bad_state"
+    assert len(session_bench.events) == 1
 
 
-def test_roles(bench: Bench) -> None:
-    assert code(bench.hello(via=b"x", peer=STRANGER, role="operator")) == "not_permitted"
-    assert bench.hello(via=b"x", peer=STRANGER)["ok"]
-    assert bench.hello(via=b"o", role="operator")["role"] == "operator"
-    bench.hello(via=b"v", role="observer")
-    assert bench.ask("status", b"v")["ok"]
-    assert bench.asked_status[0] == ME.process, "only its own tokens are for it"
-    assert bench.ask("status", b"o", after=[1, 2.5, 3])["ok"]
-    assert bench.asked_status == (None, (1, 2.5, 3))
+def test_roles(session_bench: Bench) -> None:
+    assert code(session_bench.hello(via=b"x", peer=STRANGER, role="operator")) == "not_permitted"
+    assert session_bench.hello(via=b"x", peer=STRANGER)["ok"]
+    assert session_bench.hello(via=b"o", role="operator")["role"] == "operator"
+    session_bench.hello(via=b"v", role="observer")
+    assert session_bench.ask("status", b"v")["ok"]
+    assert session_bench.asked_status[0] == ME.process, "only its own tokens are for it"
+    assert session_bench.ask("status", b"o", after=[1, 2.5, 3])["ok"]
+    assert session_bench.asked_status == (None, (1, 2.5, 3))
     lease = {"lease_id": "L1-1", "token": [1, 1]}
     for op, fields in (
         ("ready", lease),
@@ -230,13 +234,13 @@ def test_roles(bench: Bench) -> None:
         ("renew", {"leases": []}),
         ("cancel", {"lease_id": "L"}),
     ):
-        assert code(bench.ask(op, b"v", **fields)) == "not_permitted"
+        assert code(session_bench.ask(op, b"v", **fields)) == "not_permitted"
 
 
-def test_every_request_on_leases_comes_to_the_engine(bench: Bench) -> None:
-    bench.hello()
-    bench.events.clear()
-    me, token, on = bench.client(), Token(3, 7), {"lease_id": "L3-1", "token": [3, 7]}
+def test_every_request_on_leases_comes_to_the_engine(session_bench: Bench) -> None:
+    session_bench.hello()
+    session_bench.events.clear()
+    me, token, on = session_bench.client(), Token(3, 7), {"lease_id": "L3-1", "token": [3, 7]}
     wanted = {"consumer": "detector", "model_id": "m", "revision": "r", "footprint": FOOTPRINT,
     "mode": "exclusive",
               "priority": 60, "evictable": False}  # fmt: skip
@@ -250,18 +254,20 @@ def test_every_request_on_leases_comes_to_the_engine(bench: Bench) -> None:
         evictable=False,
     )
     trace = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
-    bench.ask("acquire", nonce="n1", spec=wanted, wait_timeout_s=4.0, traceparent=trace)
-    bench.ask("ready", **on, measured_bytes=5)
-    bench.ask("use_begin", **on, use_id="u", label="goal")
-    bench.ask("use_end", **on, use_id="u")
-    bench.ask("renew", leases=[on])
-    bench.ask("revoke_ack", **on, safe_point_eta_s=1.5)
-    bench.ask("unloading", **on)
-    bench.ask("release", **on, exiting=True)
-    bench.ask("cancel", lease_id="L3-1")
-    bench.ask("reattach", leases=[{**on, "spec": wanted, "state": "held", "use_ids": ["u"]}])
-    bench.ask("oom", **on, requested_bytes=11, allocated_bytes=12)
-    first = bench.next_id - 10
+    session_bench.ask("acquire", nonce="n1", spec=wanted, wait_timeout_s=4.0, traceparent=trace)
+    session_bench.ask("ready", **on, measured_bytes=5)
+    session_bench.ask("use_begin", **on, use_id="u", label="goal")
+    session_bench.ask("use_end", **on, use_id="u")
+    session_bench.ask("renew", leases=[on])
+    session_bench.ask("revoke_ack", **on, safe_point_eta_s=1.5)
+    session_bench.ask("unloading", **on)
+    session_bench.ask("release", **on, exiting=True)
+    session_bench.ask("cancel", lease_id="L3-1")
+    session_bench.ask(
+        "reattach", leases=[{**on, "spec": wanted, "state": "held", "use_ids": ["u"]}]
+    )
+    session_bench.ask("oom", **on, requested_bytes=11, allocated_bytes=12)
+    first = session_bench.next_id - 10
     held = wire.ReattachLease(LEASE, token, spec, "held", None, (USE,))
     acquire, *others = [
         wire.Acquire("n1", spec, 4.0),
@@ -276,41 +282,41 @@ def test_every_request_on_leases_comes_to_the_engine(bench: Bench) -> None:
         wire.Reattach((held,)),
         wire.Oom(LEASE, token, 11, 12),
     ]
-    assert bench.events == [
+    assert session_bench.events == [
         ev.Asked(me, RequestId(first), acquire, trace),
         *[ev.Asked(me, RequestId(first + n), request) for n, request in enumerate(others, 1)],
     ]
-    assert type(bench.events[1].request.token) is Token, "the log hides serials of tokens"
+    assert type(session_bench.events[1].request.token) is Token, "the log hides serials of tokens"
 
 
-def test_only_an_operator_acts_by_hand_and_is_named_by_the_kernel(bench: Bench) -> None:
-    bench.hello(via=b"c")
-    bench.hello(via=b"v", role="observer")
-    bench.hello(via=b"o", role="operator", name="ops")
-    bench.events.clear()
+def test_only_an_operator_acts_by_hand_and_is_named_by_the_kernel(session_bench: Bench) -> None:
+    session_bench.hello(via=b"c")
+    session_bench.hello(via=b"v", role="observer")
+    session_bench.hello(via=b"o", role="operator", name="ops")
+    session_bench.events.clear()
     for via in (b"c", b"v"):
         for op in ("evict", "kill", "pin", "unpin", "release_dead"):
-            assert code(bench.ask(op, via, target="det", reason="r")) == "not_permitted"
+            assert code(session_bench.ask(op, via, target="det", reason="r")) == "not_permitted"
         for op in ("drain", "resume"):
-            assert code(bench.ask(op, via, reason="r")) == "not_permitted"
-    assert bench.events == []
-    bench.ask("evict", b"o", target="det", reason="r")
-    bench.ask("drain", b"o", reason="new driver")
+            assert code(session_bench.ask(op, via, reason="r")) == "not_permitted"
+    assert session_bench.events == []
+    session_bench.ask("evict", b"o", target="det", reason="r")
+    session_bench.ask("drain", b"o", reason="new driver")
     by = f"ops (uid {os.getuid()}, pid {os.getpid()})"
-    me, last = bench.client(b"o"), bench.next_id
-    assert bench.events == [
+    me, last = session_bench.client(b"o"), session_bench.next_id
+    assert session_bench.events == [
         ev.Asked(me, RequestId(last - 1), wire.Evict("r", "det"), operator=by),
         ev.Asked(me, RequestId(last), wire.Drain("new driver"), operator=by),
     ]
-    assert code(bench.ask("evict", b"o", target="det")) == "bad_request", (
+    assert code(session_bench.ask("evict", b"o", target="det")) == "bad_request", (
         "an action without a reason"
     )
-    assert code(bench.ask("drain", b"o", reason="a\nb")) == "bad_request", (
+    assert code(session_bench.ask("drain", b"o", reason="a\nb")) == "bad_request", (
         "a reason is one line of history"
     )
 
 
-def test_every_op_of_the_wire_is_dispatched(bench: Bench) -> None:
+def test_every_op_of_the_wire_is_dispatched(session_bench: Bench) -> None:
     """A new op without a case in `_answer` or a row in `_REQUESTS` would get no answer."""
     on = {"lease_id": "L3-1", "token": [3, 7]}
     fields: dict[str, dict[str, Any]] = {
@@ -324,193 +330,197 @@ def test_every_op_of_the_wire_is_dispatched(bench: Bench) -> None:
         "why": {"consumer": "c"},
         **dict.fromkeys(("ready", "revoke_ack", "unloading", "release"), on),
     }  # fmt: skip
-    bench.hello()
+    session_bench.hello()
     for op in wire.REQUESTS:
-        before = len(bench.events)
-        assert bench.ask(op, **fields.get(op, {})) or len(bench.events) > before, (
+        before = len(session_bench.events)
+        assert session_bench.ask(op, **fields.get(op, {})) or len(session_bench.events) > before, (
             f"{op} is answered by nothing"
         )
 
 
-def test_reads_are_answered_at_once(bench: Bench) -> None:
-    bench.hello()
-    assert bench.ask("ping")["server"] == "test"
-    assert bench.ask("why", consumer="c")["leases"] == []
-    assert bench.ask("history", after=-5, limit=9, kinds=["granted"])["events"] == []
-    bench.ask("history", after=(1 << 64) - 1)
+def test_reads_are_answered_at_once(session_bench: Bench) -> None:
+    session_bench.hello()
+    assert session_bench.ask("ping")["server"] == "test"
+    assert session_bench.ask("why", consumer="c")["leases"] == []
+    assert session_bench.ask("history", after=-5, limit=9, kinds=["granted"])["events"] == []
+    session_bench.ask("history", after=(1 << 64) - 1)
     for typed, hint in (("grant", "did you mean granted?"), ("?" * 99, "known: ")):
-        refused = bench.ask("history", kinds=["denied", typed])["error"]
+        refused = session_bench.ask("history", kinds=["denied", typed])["error"]
         assert (refused["code"], refused["hint"][: len(hint)]) == ("bad_request", hint)
         assert len(refused["message"]) < 100
-    assert bench.questions == [(0, 9, ("granted",)), ((1 << 63) - 1, 500, ())]
+    assert session_bench.questions == [(0, 9, ("granted",)), ((1 << 63) - 1, 500, ())]
 
 
-def test_bye_ends_the_session_and_tells_the_core(bench: Bench) -> None:
-    bench.hello()
-    assert bench.ask("bye")["ok"]
-    assert bench.events[-1] == ev.ClientLeft(bench.client(), "bye")
-    assert code(bench.ask("ping")) == "unknown_session"
-    assert bench.hello()["ok"], "the connection may say hello again"
+def test_bye_ends_the_session_and_tells_the_core(session_bench: Bench) -> None:
+    session_bench.hello()
+    assert session_bench.ask("bye")["ok"]
+    assert session_bench.events[-1] == ev.ClientLeft(session_bench.client(), "bye")
+    assert code(session_bench.ask("ping")) == "unknown_session"
+    assert session_bench.hello()["ok"], "the connection may say hello again"
 
 
-def test_a_dead_process_takes_its_sessions_along(bench: Bench) -> None:
-    bench.hello(b"a")
-    bench.hello(b"b")
-    bench.table.process_died(ME.process)
-    assert len(bench.table) == 0
-    bench.table.push(bench.client(), revoke())  # no session: nothing happens
-    assert not any("push" in message for message in bench.connections[b"a"].sent)
-    bench.hang_up(b"a")  # the router hears of the death too
-    assert bench.left() == []
+def test_a_dead_process_takes_its_sessions_along(session_bench: Bench) -> None:
+    session_bench.hello(b"a")
+    session_bench.hello(b"b")
+    session_bench.table.process_died(ME.process)
+    assert len(session_bench.table) == 0
+    session_bench.table.push(session_bench.client(), revoke())  # no session: nothing happens
+    assert not any("push" in message for message in session_bench.connections[b"a"].sent)
+    session_bench.hang_up(b"a")  # the router hears of the death too
+    assert session_bench.left() == []
 
 
 # -- connections that are lost
-def test_a_lost_connection_without_a_lease_ends_its_session_at_once(bench: Bench) -> None:
+def test_a_lost_connection_without_a_lease_ends_its_session_at_once(session_bench: Bench) -> None:
     """libzmq's ROUTER never said that a peer had gone: such sessions stayed until their process
     died."""
-    bench.hello()
-    client = bench.client()
-    bench.hang_up()
-    assert len(bench.table) == 0
-    assert bench.events[-1] == ev.ClientLeft(client, "its connection was lost")
-    assert bench.watched == [], "the death of a process that never held anything concerns nothing"
+    session_bench.hello()
+    client = session_bench.client()
+    session_bench.hang_up()
+    assert len(session_bench.table) == 0
+    assert session_bench.events[-1] == ev.ClientLeft(client, "its connection was lost")
+    assert session_bench.watched == [], (
+        "the death of a process that never held anything concerns nothing"
+    )
 
 
-def test_a_holder_that_loses_its_connection_keeps_its_session(bench: Bench) -> None:
+def test_a_holder_that_loses_its_connection_keeps_its_session(session_bench: Bench) -> None:
     """The end of a use makes a safe point: a connection that breaks while a robot moves must not
     make one."""
-    bench.hello()
-    acquire(bench)
-    bench.concerned.add(bench.client())
-    bench.hang_up()
-    assert len(bench.table) == 1
-    assert bench.left() == []
-    bench.table.sweep()
-    assert len(bench.table) == 1
-    assert bench.hello(b"b", instance="i-61")["ok"], "it comes back on another connection"
-    assert len(bench.table) == 1
-    assert bench.left() == []
-    assert bench.watched == [ME.process]
+    session_bench.hello()
+    acquire(session_bench)
+    session_bench.concerned.add(session_bench.client())
+    session_bench.hang_up()
+    assert len(session_bench.table) == 1
+    assert session_bench.left() == []
+    session_bench.table.sweep()
+    assert len(session_bench.table) == 1
+    assert session_bench.hello(b"b", instance="i-61")["ok"], "it comes back on another connection"
+    assert len(session_bench.table) == 1
+    assert session_bench.left() == []
+    assert session_bench.watched == [ME.process]
 
 
-def test_a_lost_session_ends_when_the_engine_has_forgotten_its_client(bench: Bench) -> None:
-    bench.hello()
-    acquire(bench)
-    client = bench.client()
-    bench.concerned.add(client)
-    bench.hang_up()
-    bench.concerned.clear()  # its lease expired
-    bench.table.sweep()
-    assert len(bench.table) == 0
-    assert bench.left() == [client]
-    assert bench.watched == [ME.process], "it may keep bytes on a GPU until it dies"
+def test_a_lost_session_ends_when_the_engine_has_forgotten_its_client(session_bench: Bench) -> None:
+    session_bench.hello()
+    acquire(session_bench)
+    client = session_bench.client()
+    session_bench.concerned.add(client)
+    session_bench.hang_up()
+    session_bench.concerned.clear()  # its lease expired
+    session_bench.table.sweep()
+    assert len(session_bench.table) == 0
+    assert session_bench.left() == [client]
+    assert session_bench.watched == [ME.process], "it may keep bytes on a GPU until it dies"
 
 
-def test_a_process_that_was_watched_before_its_hello_stays_watched(bench: Bench) -> None:
+def test_a_process_that_was_watched_before_its_hello_stays_watched(session_bench: Bench) -> None:
     """From the journal: its lease is recovered, whatever becomes of this connection."""
-    bench.watched.append(ME.process)
-    bench.hello()
-    bench.hang_up()
-    assert bench.watched == [ME.process]
+    session_bench.watched.append(ME.process)
+    session_bench.hello()
+    session_bench.hang_up()
+    assert session_bench.watched == [ME.process]
 
 
-def test_a_lost_subscriber_is_sent_nothing_more(bench: Bench) -> None:
-    bench.hello()
-    assert bench.ask("subscribe")["ok"]
-    bench.hang_up()
-    bench.table.broadcast({"seq": 1, "kind": "granted"})
-    assert bench.hello(b"b")["ok"]
-    assert bench.ask("subscribe", b"b")["ok"], "its place is free"
+def test_a_lost_subscriber_is_sent_nothing_more(session_bench: Bench) -> None:
+    session_bench.hello()
+    assert session_bench.ask("subscribe")["ok"]
+    session_bench.hang_up()
+    session_bench.table.broadcast({"seq": 1, "kind": "granted"})
+    assert session_bench.hello(b"b")["ok"]
+    assert session_bench.ask("subscribe", b"b")["ok"], "its place is free"
 
 
-def test_a_stranger_that_hangs_up_is_no_event(bench: Bench) -> None:
-    bench.raw(b"junk")
-    bench.hang_up()
-    assert bench.events == []
+def test_a_stranger_that_hangs_up_is_no_event(session_bench: Bench) -> None:
+    session_bench.raw(b"junk")
+    session_bench.hang_up()
+    assert session_bench.events == []
 
 
-def test_an_instance_on_a_new_connection_replaces_its_old_one(bench: Bench) -> None:
+def test_an_instance_on_a_new_connection_replaces_its_old_one(session_bench: Bench) -> None:
     """The new connection may be read before the end of the old one."""
     for via in (b"a", b"b", b"c"):
-        assert bench.hello(via, instance="same")["ok"]
-    assert len(bench.table) == 1
-    assert bench.left() == [], "nothing is lost by reconnecting"
+        assert session_bench.hello(via, instance="same")["ok"]
+    assert len(session_bench.table) == 1
+    assert session_bench.left() == [], "nothing is lost by reconnecting"
     for via in (b"b", b"c"):
-        bench.table.push(bench.client(via), GrantedPush(lease_view()))
-        assert bench.connections[b"c"].sent[-1]["push"] == "granted", (
+        session_bench.table.push(session_bench.client(via), GrantedPush(lease_view()))
+        assert session_bench.connections[b"c"].sent[-1]["push"] == "granted", (
             "it reaches the new connection"
         )
-    assert len(bench.connections[b"c"].sent) == 3
-    assert bench.connections[b"a"].closed, "the old connection has no use any more"
+    assert len(session_bench.connections[b"c"].sent) == 3
+    assert session_bench.connections[b"a"].closed, "the old connection has no use any more"
     for via in (b"a", b"b"):
-        bench.table.disconnected(bench.connections[via], "closed")
-    assert len(bench.table) == 1
-    bench.ask("bye", b"c")
-    assert bench.left() == [bench.client(b"c")], "the core has moved what was the earlier ones'"
+        session_bench.table.disconnected(session_bench.connections[via], "closed")
+    assert len(session_bench.table) == 1
+    session_bench.ask("bye", b"c")
+    assert session_bench.left() == [session_bench.client(b"c")], (
+        "the core has moved what was the earlier ones'"
+    )
 
 
-def test_the_same_instance_of_another_process_is_another_client(bench: Bench) -> None:
-    assert bench.hello(b"a", instance="same")["ok"]
-    assert bench.hello(b"b", peer=PARENT, instance="same")["ok"]
-    assert len(bench.table) == 2
+def test_the_same_instance_of_another_process_is_another_client(session_bench: Bench) -> None:
+    assert session_bench.hello(b"a", instance="same")["ok"]
+    assert session_bench.hello(b"b", peer=PARENT, instance="same")["ok"]
+    assert len(session_bench.table) == 2
 
 
 # -- shares
-def test_the_rate_is_limited_per_session_and_refills(bench: Bench) -> None:
-    bench.hello(b"a")
-    bench.hello(b"b")
-    replies = [bench.ask("ping") for _ in range(150)]
+def test_the_rate_is_limited_per_session_and_refills(session_bench: Bench) -> None:
+    session_bench.hello(b"a")
+    session_bench.hello(b"b")
+    replies = [session_bench.ask("ping") for _ in range(150)]
     refused = [reply for reply in replies if not reply["ok"]]
     assert len(refused) == 51  # a hundred a second, the hello was one of them
     assert code(refused[0]) == "limit_exceeded"
     assert refused[0]["error"]["details"] == {
         "limit": "rate_per_client_per_s", "value": 100, "process_value": 1000,
     }  # fmt: skip
-    assert bench.ask("ping", b"b")["ok"], "another client is not affected"
-    bench.now += 0.5
-    assert sum(bench.ask("ping")["ok"] for _ in range(60)) == 50
+    assert session_bench.ask("ping", b"b")["ok"], "another client is not affected"
+    session_bench.now += 0.5
+    assert sum(session_bench.ask("ping")["ok"] for _ in range(60)) == 50
 
 
 def test_the_rate_of_a_process_is_limited_over_all_its_connections() -> None:
-    bench = make_bench(rate_per_process_per_s=150, sessions_max=10)
-    assert sum(bench.hello(b"%d" % number)["ok"] for number in range(5)) == 5
-    replies = [bench.ask("ping", b"%d" % (number % 5)) for number in range(200)]
+    session_bench = make_bench(rate_per_process_per_s=150, sessions_max=10)
+    assert sum(session_bench.hello(b"%d" % number)["ok"] for number in range(5)) == 5
+    replies = [session_bench.ask("ping", b"%d" % (number % 5)) for number in range(200)]
     assert sum(reply["ok"] for reply in replies) == 145
-    assert bench.hello(b"p", peer=PARENT)["ok"], "another process is not affected"
+    assert session_bench.hello(b"p", peer=PARENT)["ok"], "another process is not affected"
 
 
 def test_connecting_again_does_not_refill_the_rate_of_a_process() -> None:
-    bench = make_bench(rate_per_process_per_s=150)
+    session_bench = make_bench(rate_per_process_per_s=150)
     accepted = 0
     for _ in range(10):
-        accepted += sum(code(bench.raw(b"junk")) == "bad_frame" for _ in range(50))
-        bench.hang_up()
+        accepted += sum(code(session_bench.raw(b"junk")) == "bad_frame" for _ in range(50))
+        session_bench.hang_up()
     assert accepted == 150
 
 
-def test_a_large_message_is_charged_for_its_size(bench: Bench) -> None:
+def test_a_large_message_is_charged_for_its_size(session_bench: Bench) -> None:
     """The cost of a message grows with its bytes: 2,000 of 1 MiB a second would take all the time
     there is."""
-    bench.hello()
-    assert code(bench.ask("ping", pad="x" * 3000)) == "bad_request"  # 1 + 2
-    assert sum(bench.ask("ping")["ok"] for _ in range(150)) == 96
-    bench.now += 1
-    assert code(bench.raw(Oversize(1 << 30, 4096))) == "message_too_large"
-    bench.now += 100
-    assert code(bench.ask("ping")) == "limit_exceeded", "a gigabyte is paid for"
+    session_bench.hello()
+    assert code(session_bench.ask("ping", pad="x" * 3000)) == "bad_request"  # 1 + 2
+    assert sum(session_bench.ask("ping")["ok"] for _ in range(150)) == 96
+    session_bench.now += 1
+    assert code(session_bench.raw(Oversize(1 << 30, 4096))) == "message_too_large"
+    session_bench.now += 100
+    assert code(session_bench.ask("ping")) == "limit_exceeded", "a gigabyte is paid for"
 
 
-def test_a_message_that_was_skipped_is_answered(bench: Bench) -> None:
-    refused = bench.raw(Oversize(70_000, 65_536))
+def test_a_message_that_was_skipped_is_answered(session_bench: Bench) -> None:
+    refused = session_bench.raw(Oversize(70_000, 65_536))
     assert code(refused) == "message_too_large"
     assert refused["error"]["details"] == {"size_bytes": 70_000, "limit_bytes": 65_536}
     assert "hello" in refused["error"]["hint"], "a stranger may send less than a client"
 
 
-def test_one_over_the_rate_is_told_so_whatever_it_sent(bench: Bench) -> None:
+def test_one_over_the_rate_is_told_so_whatever_it_sent(session_bench: Bench) -> None:
     """Each is answered to its id, and nothing of it is looked at but that."""
-    bench.hello(b"a")
-    connection, received = bench.connections[b"a"], bench.table.received
+    session_bench.hello(b"a")
+    connection, received = session_bench.connections[b"a"], session_bench.table.received
     pings = [received(connection, msgpack.packb({"op": "ping", "id": n})) for n in range(100)]
     assert pings == [*[True] * 99, False]
     for payload, request in (
@@ -522,33 +532,35 @@ def test_one_over_the_rate_is_told_so_whatever_it_sent(bench: Bench) -> None:
         (msgpack.packb({"op": "ping", "id": 8, "pad": "x" * 70_000}), None),
         (Oversize(1 << 20, 4096), None),
     ):
-        reply = bench.raw(payload)
+        reply = session_bench.raw(payload)
         assert (code(reply), reply["re"]) == ("limit_exceeded", request)
 
 
-def test_strangers_do_not_use_up_each_others_rate(bench: Bench) -> None:
+def test_strangers_do_not_use_up_each_others_rate(session_bench: Bench) -> None:
     """All connections without a hello shared one budget: one of them kept every other client from
     its hello."""
     for _ in range(150):
-        bench.raw(b"junk", b"z")
-    assert code(bench.raw(b"junk", b"z")) == "limit_exceeded"
-    assert bench.hello(b"y", peer=STRANGER)["ok"]
+        session_bench.raw(b"junk", b"z")
+    assert code(session_bench.raw(b"junk", b"z")) == "limit_exceeded"
+    assert session_bench.hello(b"y", peer=STRANGER)["ok"]
 
 
 def test_one_process_and_one_user_leave_room_for_others() -> None:
     """One process took all sessions, and neither another user nor an operator could connect."""
-    bench = make_bench(sessions_max=10, process_share=0.4, user_share=0.6, operator_reserve=2)
+    session_bench = make_bench(
+        sessions_max=10, process_share=0.4, user_share=0.6, operator_reserve=2
+    )
     other_user, third = peer_of(os.getppid(), 54_321, 54_321), peer_of(os.getpid(), 7, 7)
-    codes = [bench.hello(b"m%d" % number, peer=STRANGER) for number in range(6)]
+    codes = [session_bench.hello(b"m%d" % number, peer=STRANGER) for number in range(6)]
     assert [reply["ok"] for reply in codes] == [True] * 4 + [False] * 2
     assert codes[4]["error"]["details"] == {"limit": "process_share", "value": 4}
-    codes = [bench.hello(b"n%d" % number, peer=other_user) for number in range(3)]
+    codes = [session_bench.hello(b"n%d" % number, peer=other_user) for number in range(3)]
     assert [reply["ok"] for reply in codes] == [True, True, False]
     assert codes[2]["error"]["details"] == {"limit": "user_share", "value": 6}
-    codes = [bench.hello(b"o%d" % number, peer=third) for number in range(3)]
+    codes = [session_bench.hello(b"o%d" % number, peer=third) for number in range(3)]
     assert [reply["ok"] for reply in codes] == [True, False, False]
     assert codes[2]["error"]["details"] == {"limit": "sessions_max", "value": 7}
-    assert bench.hello(b"p", role="operator")["ok"], "places are kept for operators"
+    assert session_bench.hello(b"p", role="operator")["ok"], "places are kept for operators"
 
 
 def test_processes_without_a_session_have_a_reserve() -> None:
@@ -558,140 +570,144 @@ def test_processes_without_a_session_have_a_reserve() -> None:
     def runaway(pid: int) -> Peer:
         return Peer(ProcessKey(pid, 7), 7, 7, -1)
 
-    bench = make_bench(sessions_max=40, process_share=0.5, user_share=0.8)  # 32 of a user
+    session_bench = make_bench(sessions_max=40, process_share=0.5, user_share=0.8)  # 32 of a user
     hellos = [
-        bench.hello(b"r%d-%d" % (process, number), peer=runaway(1000 + process))
+        session_bench.hello(b"r%d-%d" % (process, number), peer=runaway(1000 + process))
         for number in range(20)
         for process in range(2)
     ]
     refused = [reply["error"]["details"] for reply in hellos if not reply["ok"]]
     assert refused == [{"limit": "user_share", "value": 28}] * 12
-    first = [bench.hello(b"n%d" % one, peer=runaway(2000 + one)) for one in range(5)]
+    first = [session_bench.hello(b"n%d" % one, peer=runaway(2000 + one)) for one in range(5)]
     assert [reply["ok"] for reply in first] == [True] * 4 + [False]
-    assert code(bench.hello(b"again", peer=runaway(2000))) == "limit_exceeded"
+    assert code(session_bench.hello(b"again", peer=runaway(2000))) == "limit_exceeded"
 
 
 def test_processes_that_held_something_and_left_have_a_share() -> None:
     """Each costs a descriptor until it dies: processes of one user that lease, leave and live on
     took all there are."""
-    bench = make_bench(processes_max=4, user_share=0.5)
+    session_bench = make_bench(processes_max=4, user_share=0.5)
 
     def holder(number: int, uid: int, role: str = "client") -> dict[str, Any]:
         via, peer = b"%d" % number, Peer(ProcessKey(1000 + number, 7), uid, uid, -1)
-        reply = bench.hello(via, peer=peer, role=role)
-        bench.ask(
+        reply = session_bench.hello(via, peer=peer, role=role)
+        session_bench.ask(
             "acquire",
             via,
             peer,
             nonce="n",
             spec={"consumer": "c", "model_id": "m", "footprint": FOOTPRINT},
         )
-        bench.hang_up(via)
+        session_bench.hang_up(via)
         return reply
 
     assert [holder(number, 1000)["ok"] for number in range(3)] == [True, True, False]
     assert holder(4, 2000)["ok"], "another user"
     assert holder(5, 0, "operator")["ok"], "an operator"
     assert code(holder(6, 2000)) == "limit_exceeded", "all descriptors are taken"
-    bench.table.process_died(ProcessKey(1000, 7))
+    session_bench.table.process_died(ProcessKey(1000, 7))
     assert holder(7, 2000)["ok"]
-    assert len(bench.watched) == 5
+    assert len(session_bench.watched) == 5
 
 
 def test_lost_and_silent_sessions_of_a_process_make_room_for_it() -> None:
-    bench = make_bench(sessions_max=8, process_share=0.25)
-    bench.hello(b"a", peer=PARENT)
-    assert bench.hello(b"b")["ok"]
-    assert bench.hello(b"c")["ok"]
-    assert code(bench.hello(b"d")) == "limit_exceeded"
-    bench.now += 11
-    bench.ask("ping", b"c")
-    assert bench.hello(b"d")["ok"]
-    assert bench.left() == [bench.client(b"b")], "the other process keeps its own"
+    session_bench = make_bench(sessions_max=8, process_share=0.25)
+    session_bench.hello(b"a", peer=PARENT)
+    assert session_bench.hello(b"b")["ok"]
+    assert session_bench.hello(b"c")["ok"]
+    assert code(session_bench.hello(b"d")) == "limit_exceeded"
+    session_bench.now += 11
+    session_bench.ask("ping", b"c")
+    assert session_bench.hello(b"d")["ok"]
+    assert session_bench.left() == [session_bench.client(b"b")], "the other process keeps its own"
 
 
-def test_at_the_limit_of_sessions_the_silent_ones_make_room(bench: Bench) -> None:
+def test_at_the_limit_of_sessions_the_silent_ones_make_room(session_bench: Bench) -> None:
     for via in (b"a", b"b", b"c"):
-        bench.hello(via)
-    reply = bench.hello(b"d")
+        session_bench.hello(via)
+    reply = session_bench.hello(b"d")
     assert code(reply) == "limit_exceeded"
     assert reply["error"]["details"]["value"] == 3
-    acquire(bench)
-    bench.concerned.add(bench.client())
-    bench.now += 8
-    bench.ask("ping", b"c")
-    bench.now += 8
-    assert bench.hello(b"d")["ok"]
-    assert bench.left() == [bench.client(b"b")], "a holds a lease, c spoke a moment ago"
+    acquire(session_bench)
+    session_bench.concerned.add(session_bench.client())
+    session_bench.now += 8
+    session_bench.ask("ping", b"c")
+    session_bench.now += 8
+    assert session_bench.hello(b"d")["ok"]
+    assert session_bench.left() == [session_bench.client(b"b")], (
+        "a holds a lease, c spoke a moment ago"
+    )
 
 
-def test_no_descriptor_left_is_a_typed_error(bench: Bench) -> None:
-    bench.watchable = False
-    reply = bench.hello()
+def test_no_descriptor_left_is_a_typed_error(session_bench: Bench) -> None:
+    session_bench.watchable = False
+    reply = session_bench.hello()
     assert code(reply) == "limit_exceeded"
     assert reply["error"]["details"] == {"limit": "open_files"}
-    assert len(bench.table) == 0
+    assert len(session_bench.table) == 0
 
 
-def test_subscribers_receive_events_and_are_limited(bench: Bench) -> None:
-    bench.hello(b"a")
-    bench.hello(b"b")
-    assert bench.ask("subscribe", b"a")["ok"]
-    assert bench.ask("subscribe", b"a")["ok"], "twice is once"
-    assert code(bench.ask("subscribe", b"b")) == "limit_exceeded"
-    bench.table.broadcast({"seq": 1, "kind": "granted"})
-    assert bench.connections[b"a"].sent[-1] == {
+def test_subscribers_receive_events_and_are_limited(session_bench: Bench) -> None:
+    session_bench.hello(b"a")
+    session_bench.hello(b"b")
+    assert session_bench.ask("subscribe", b"a")["ok"]
+    assert session_bench.ask("subscribe", b"a")["ok"], "twice is once"
+    assert code(session_bench.ask("subscribe", b"b")) == "limit_exceeded"
+    session_bench.table.broadcast({"seq": 1, "kind": "granted"})
+    assert session_bench.connections[b"a"].sent[-1] == {
         "push": "event", "seq": 1, "epoch": 3, "event": {"seq": 1, "kind": "granted"},
     }  # fmt: skip
 
 
 def test_one_process_does_not_take_all_subscriptions() -> None:
-    bench = make_bench(subscribers_max=4, process_share=0.5, sessions_max=20)
+    session_bench = make_bench(subscribers_max=4, process_share=0.5, sessions_max=20)
     for via in (b"a", b"b", b"c"):
-        bench.hello(via)
-    answers = [bench.ask("subscribe", via) for via in (b"a", b"b", b"c")]
+        session_bench.hello(via)
+    answers = [session_bench.ask("subscribe", via) for via in (b"a", b"b", b"c")]
     assert [answer["ok"] for answer in answers] == [True, True, False]
     assert answers[2]["error"]["details"] == {"limit": "process_share", "value": 2}
-    bench.hello(b"p", peer=PARENT)
-    assert bench.ask("subscribe", b"p")["ok"]
+    session_bench.hello(b"p", peer=PARENT)
+    assert session_bench.ask("subscribe", b"p")["ok"]
 
 
-def test_pushes_are_numbered_per_session(bench: Bench) -> None:
-    bench.hello(b"a")
+def test_pushes_are_numbered_per_session(session_bench: Bench) -> None:
+    session_bench.hello(b"a")
     for _ in range(3):
-        bench.table.push(bench.client(), revoke())
-    sent = bench.connections[b"a"].sent
+        session_bench.table.push(session_bench.client(), revoke())
+    sent = session_bench.connections[b"a"].sent
     assert [message["seq"] for message in sent if "push" in message] == [1, 2, 3]
 
 
-def test_an_unreachable_peer_is_no_error(bench: Bench) -> None:
-    bench.hello()
-    connection = bench.connections[b"a"]
+def test_an_unreachable_peer_is_no_error(session_bench: Bench) -> None:
+    session_bench.hello()
+    connection = session_bench.connections[b"a"]
     connection.reachable = False
-    bench.table.push(bench.client(), revoke())
-    assert bench.ask("ping") == {}
+    session_bench.table.push(session_bench.client(), revoke())
+    assert session_bench.ask("ping") == {}
     connection.reachable = True
-    assert bench.ask("ping")["ok"]
+    assert session_bench.ask("ping")["ok"]
 
 
-def test_bad_frames_change_nothing(bench: Bench) -> None:
-    bench.hello()
-    bench.events.clear()
+def test_bad_frames_change_nothing(session_bench: Bench) -> None:
+    session_bench.hello()
+    session_bench.events.clear()
     for payload in (b"", b"\xc1", msgpack.packb([1]), b"x" * 5000):
-        assert bench.raw(payload)["ok"] is False
-    assert bench.events == []
-    assert bench.ask("ping")["ok"]
+        assert session_bench.raw(payload)["ok"] is False
+    assert session_bench.events == []
+    assert session_bench.ask("ping")["ok"]
 
 
 def test_every_refusal_is_in_the_log_with_its_reason(
-    bench: Bench, caplog: pytest.LogCaptureFixture
+    session_bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A request that was refused at once was nowhere but in its own program's error message."""
     caplog.set_level("INFO")
-    bench.ask("status")
-    bench.hello()
-    bench.ask("evict", target="L3-1", reason="by hand")
-    bench.table.refuse(bench.client(), RequestId(9), ErrorView("vram_insufficient", "9 GiB of 8"))
+    session_bench.ask("status")
+    session_bench.hello()
+    session_bench.ask("evict", target="L3-1", reason="by hand")
+    session_bench.table.refuse(
+        session_bench.client(), RequestId(9), ErrorView("vram_insufficient", "9 GiB of 8")
+    )
     said = [record.getMessage() for record in caplog.records if record.name == "arbiter.refusals"]
     whose = f"pid {ME.process.pid}, uid {ME.uid}"
     assert said == [

@@ -13,11 +13,7 @@ from vram_arbiter.schemas.ids import GpuId, LeaseId
 
 GIB = d.GIB
 ZERO, ONE = GpuId("GPU-0"), GpuId("GPU-1")
-
-
-@pytest.fixture
-def driver() -> CoreDriver:
-    return CoreDriver(8 * GIB, gpus=2)
+GPUS = 2
 
 
 # -- selector and placement

@@ -51,39 +51,45 @@ class Scene:
         return next(iter(state_of(self.driver.arbiter).gpus.values()))
 
 
-def one(name: str, gib: float, *, used: bool = False, **spec: Any) -> dict[str, Any]:
+def has(name: str, gib: float, *, used: bool = False, **spec: Any) -> dict[str, Any]:
     return {"name": name, "gib": gib, "used": used, **spec}
 
 
-WEAKER = [one("low", 1, priority=10), one("mid", 2, priority=20), one("high", 4, priority=30)]
+WEAKER = [
+    has("low", 1, priority=10),
+    has("mid", 2, priority=20),
+    has("high", 4, priority=30),
+]
 VICTIMS: dict[str, tuple[list[dict[str, Any]], dict[str, Any], set[str]]] = {
-    "it fits": ([one("a", 3)], {"gib": 5}, set()),
+    "it fits": ([has("a", 3)], {"gib": 5}, set()),
     "one that covers is better than two": (
-        [one("small", 1), one("medium", 2), one("large", 4)], {"gib": 5}, {"large"},
+        [has("small", 1), has("medium", 2), has("large", 4)], {"gib": 5}, {"large"},
     ),
-    "of equals the one that wastes least": ([one("three", 3), one("four", 4)], {"gib": 4}, {"three"}),
+    "of equals the one that wastes least": (
+        [has("three", 3), has("four", 4)], {"gib": 4}, {"three"},
+    ),
     "lower priority before better size": (
-        [one("exact", 3, priority=60), one("cheap", 4, priority=40)], {"gib": 4}, {"cheap"},
+        [has("exact", 3, priority=60), has("cheap", 4, priority=40)], {"gib": 4}, {"cheap"},
     ),
     "lower classes if they are enough": (WEAKER, {"gib": 4}, {"low", "mid"}),
     "a higher class if not": (WEAKER, {"gib": 5}, {"high"}),
     "idle before in use, even if more have to": (
-        [one("a", 2), one("b", 2), one("busy", 4, used=True)], {"gib": 4}, {"a", "b"},
+        [has("a", 2), has("b", 2), has("busy", 4, used=True)], {"gib": 4}, {"a", "b"},
     ),
     "in vain: the idle one alone would not be enough": (
-        [one("busy", 4, priority=90, used=True), one("idle", 2)], {"gib": 5}, set(),
+        [has("busy", 4, priority=90, used=True), has("idle", 2)], {"gib": 5}, set(),
     ),
     "a fresh one that would not help is not waited for": (
-        [one("busy", 5, used=True), one("fresh", 0.5, min_residency_s=2.0)], {"gib": 4}, {"busy"},
+        [has("busy", 5, used=True), has("fresh", 0.5, min_residency_s=2.0)], {"gib": 4}, {"busy"},
     ),
     "exclusive empties the GPU": (
-        [one("a", 1), one("b", 1)], {"gib": 1, "exclusive": True}, {"a", "b"},
+        [has("a", 1), has("b", 1)], {"gib": 1, "exclusive": True}, {"a", "b"},
     ),
     "exclusive, in vain: one stays": (
-        [one("a", 1), one("busy", 1, priority=90, used=True)], {"gib": 1, "exclusive": True}, set(),
+        [has("a", 1), has("busy", 1, priority=90, used=True)], {"gib": 1, "exclusive": True}, set(),
     ),
     "an exclusive holder has to go for anyone": (
-        [one("alone", 1, exclusive=True)], {"gib": 1}, {"alone"},
+        [has("alone", 1, exclusive=True)], {"gib": 1}, {"alone"},
     ),
 }  # fmt: skip
 
@@ -92,10 +98,10 @@ VICTIMS: dict[str, tuple[list[dict[str, Any]], dict[str, Any], set[str]]] = {
 def test_who_is_asked(case: str) -> None:
     scene = Scene()
     holders, wish, asked = VICTIMS[case]
-    for holder in holders:
-        scene.hold(**{key: value for key, value in holder.items() if key != "used"})
-        if holder["used"]:
-            scene.use(holder["name"])
+    for held in holders:
+        scene.hold(**{key: value for key, value in held.items() if key != "used"})
+        if held["used"]:
+            scene.use(held["name"])
     assert scene.want(**wish) == asked
     assert scene.driver.state(scene.held["w"]) == ("loading" if case == "it fits" else "queued")
     if not asked:

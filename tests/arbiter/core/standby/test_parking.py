@@ -215,6 +215,7 @@ def test_an_operator_keeps_a_parked_one_from_coming_back_by_itself() -> None:
     vlm, lease, policy, wanted = parked(driver, standby=True)
     ops = driver.consumer("ops")
     ops.order("evict", lease)
+    assert driver.notes("operator")[-1]["action"] == "evict"
     assert driver.journal[f"lease:{lease}"].get("comes_back", False) is False
     policy.unload(wanted)
     driver.advance(20.0)
