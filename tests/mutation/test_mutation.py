@@ -100,6 +100,7 @@ def test_the_lines_that_a_test_comes_by_are_seen_though_the_engine_is_imported_b
     assert any(line.startswith("state:") for line in coverage.tests)
 
 
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")  # it forks on purpose
 def test_a_mutant_that_no_test_comes_by_survives(tmp_path: Path) -> None:
     """As above: without tests the trial ended in an error."""
     if not (pid := os.fork()):
