@@ -258,6 +258,7 @@ def test_renewing_keeps_alive_and_never_resurrects(driver: CoreDriver) -> None:
     assert driver.state(lease) == "over"
     (gone,) = answer(det.renew((lease, token)))["gone"]
     assert gone["error"]["code"] == "lease_expired"
+    assert gone["error"]["details"].keys() == {"lease_id", "ttl_s"}, "for the usual reason"
     assert driver.pushes("lost", lease)[0]["error"]["code"] == "lease_expired"
     assert driver.state(lease) == "over"
 
@@ -275,6 +276,7 @@ def test_unloading_waits_for_the_safe_point_whoever_marked_the_use(driver: CoreD
     runner.use_end(lease, "goal", det.token(lease))
     assert kinds(det.unloading(lease)) == ["Reply", "Note:unloading"]
     assert kinds(det.unloading(lease)) == ["Reply"], "a repeat"
+    assert driver.notes("unloading")[0]["asked"] is False
 
 
 def test_release_may_be_repeated_before_and_after_the_verdict(driver: CoreDriver) -> None:
