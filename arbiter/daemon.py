@@ -21,7 +21,8 @@ from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
 from vram_arbiter.arbiter.core.events import ProcessDied
 from vram_arbiter.arbiter.core.settings import GpuInfo
-from vram_arbiter.arbiter.eventlog.writer import Recorder, freezer
+from vram_arbiter.arbiter.eventlog.snapshot import to_plain
+from vram_arbiter.arbiter.eventlog.writer import Recorder
 from vram_arbiter.arbiter.host.executor import Executor
 from vram_arbiter.arbiter.host.gpu.open import open_probe
 from vram_arbiter.arbiter.host.gpu.probe import GpuProbe
@@ -195,7 +196,7 @@ class Daemon:
                 self._version,
                 max_bytes=config.record.max_bytes,
                 file_bytes=config.record.file_bytes,
-                freeze_engine=freezer(self._engine),
+                state=partial(to_plain, self._engine),
                 told=self._say,
             )
             recorder.start(self._loop, made_at)

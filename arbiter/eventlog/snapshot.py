@@ -3,20 +3,18 @@ whole life.
 
 A graph of objects: every container and instance once, by number, so that what was shared stays
 shared. Only classes of the core and its ids are ever made, without running any of their code.
-`freeze` is the part that must be quick: a copy at one moment, on the decision path; everything else
-can happen on another thread.
+`to_plain` is on the decision path, some 0.1 ms per lease; everything else can happen on another
+thread.
 """
 
 import importlib
-import io
-import pickle
-import sys
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from operator import attrgetter
-from typing import Any, cast
+from functools import cache
+from types import NoneType
+from typing import Any
 
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.schemas.codec import CodecError
@@ -26,76 +24,7 @@ _HOMES = ("vram_arbiter.arbiter.core.", "vram_arbiter.schemas.ids", "vram_arbite
 
 type Ref = list[int]
 
-
-# -- a copy at one moment --------------------------------------------------------------------------
-def freeze(arbiter: Arbiter) -> bytes:
-    """The state as it is now, in a form for `thaw` in this very process.
-
-    Some microseconds per lease.
-    """
-    sink = io.BytesIO()
-    pickler = pickle.Pickler(sink, protocol=pickle.HIGHEST_PROTOCOL)
-    pickler.dispatch_table = _reducers()
-    pickler.dump(arbiter)
-    return sink.getvalue()
-
-
-def thaw(frozen: bytes) -> Arbiter:
-    """Only for bytes that `freeze` made in this process: files hold JSON, nothing that could
-    run."""
-    return cast(Arbiter, pickle.loads(frozen))
-
-
-type _Reduce = Callable[[Any], tuple[Any, ...]]
-
-_known_reducers: dict[type, _Reduce] = {}
-
-
-def _reducers() -> dict[type, _Reduce]:
-    """Frozen dataclasses with slots pickle themselves slowly; their constructor and values do it in
-    a third of the time. Maps with bookkeeping of their own are copied as they are, not built up
-    again.
-    """
-    if not _known_reducers:
-        for name, module in list(sys.modules.items()):
-            if name.startswith(_HOMES):
-                for cls in vars(module).values():
-                    if isinstance(cls, type) and is_dataclass(cls) and _is_frozen(cls):
-                        _known_reducers[cls] = _reducer(cls)
-                    elif _is_map(cls):
-                        _known_reducers[cls] = _reduce_map
-    return _known_reducers
-
-
-def _is_frozen(cls: type) -> bool:
-    found: Any = cls  # the stub of dataclasses lacks the attribute
-    return bool(found.__dataclass_params__.frozen)
-
-
-def _is_map(cls: object) -> bool:
-    return isinstance(cls, type) and issubclass(cls, dict) and cls.__module__.startswith(_HOMES)
-
-
-def _reduce_map(value: Any) -> tuple[Any, ...]:
-    return _new, (type(value),), (dict(value), dict(_attributes(value))), None, None, _set_map
-
-
-def _new(cls: Any) -> Any:
-    return cls.__new__(cls)
-
-
-def _set_map(made: Any, state: tuple[Mapping[Any, Any], JsonMap]) -> None:
-    dict.update(made, state[0])
-    for name, value in state[1].items():
-        object.__setattr__(made, name, value)
-
-
-def _reducer(cls: type) -> _Reduce:
-    names = [field.name for field in fields(cls)]
-    if len(names) < 2:
-        return lambda value: (cls, tuple(getattr(value, name) for name in names))
-    values = attrgetter(*names)
-    return lambda value: (cls, values(value))
+_PLAIN = frozenset((NoneType, bool, int, float, str))
 
 
 # -- state → JSON ----------------------------------------------------------------------------------
@@ -117,7 +46,7 @@ class _Graph:
 
     def value(self, value: Any) -> Any:
         """Plain values as they are, everything else as `[number]`."""
-        if value is None or type(value) in (bool, int, float, str):
+        if type(value) in _PLAIN:
             return value
         if (ref := self._seen.get(id(value))) is not None:
             return ref
@@ -127,39 +56,65 @@ class _Graph:
         self.objects[ref[0]] = self._entry(value)
         return ref
 
+    def _values(self, items: Iterable[Any]) -> list[Any]:
+        return [item if type(item) in _PLAIN else self.value(item) for item in items]
+
     def _entry(self, value: Any) -> Any:
-        kind = type(value)
+        kind: Any = type(value)
         if kind in (list, tuple, set, frozenset):
-            return [kind.__name__, [self.value(item) for item in value]]
+            return [kind.__name__, self._values(value)]
         if kind in (dict, OrderedDict):
-            return [
-                kind.__name__,
-                [[self.value(key), self.value(item)] for key, item in value.items()],
-            ]
+            return [kind.__name__, [self._values(pair) for pair in value.items()]]
         if kind is deque:
-            return ["deque", value.maxlen, [self.value(item) for item in value]]
-        if not kind.__module__.startswith(_HOMES):
-            raise CodecError(
-                f"{kind.__module__}.{kind.__qualname__} has no place in the engine's state"
-            )
-        name = f"{kind.__module__}:{kind.__qualname__}"
+            return ["deque", value.maxlen, self._values(value)]
+        name = _name(kind)
         if isinstance(value, Enum):
             return ["enum", name, value.value]
         if isinstance(value, tuple):
-            return ["named", name, [self.value(item) for item in value]]
-        attributes = {key: self.value(item) for key, item in _attributes(value)}
+            return ["named", name, self._values(value)]
+        attributes = _attributes(value)
+        plain = dict(zip(attributes, self._values(attributes.values()), strict=True))
         if isinstance(value, dict):
-            pairs = [[self.value(key), self.value(item)] for key, item in dict.items(value)]
-            return ["map", name, pairs, attributes]
-        return ["object", name, attributes]
+            return ["map", name, [self._values(pair) for pair in dict.items(value)], plain]
+        return ["object", name, plain]
 
 
-def _attributes(value: Any) -> Iterable[tuple[str, Any]]:
-    names = dict.fromkeys(getattr(value, "__dict__", {}))
-    for cls in type(value).__mro__:
+@cache
+def _name(kind: type) -> str:
+    """Raises CodecError for a class that is no class of the engine."""
+    if not kind.__module__.startswith(_HOMES):
+        raise CodecError(
+            f"{kind.__module__}.{kind.__qualname__} has no place in the engine's state"
+        )
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def _attributes(value: Any) -> dict[str, Any]:
+    kind: Any = type(value)
+    found = dict(getattr(value, "__dict__", ()))
+    for name in _slots(kind):
+        if hasattr(value, name):
+            found[name] = getattr(value, name)
+    return found
+
+
+@cache
+def _slots(kind: type) -> tuple[str, ...]:
+    names: dict[str, None] = {}
+    for cls in kind.__mro__:
         slots = vars(cls).get("__slots__", ())
         names |= dict.fromkeys((slots,) if isinstance(slots, str) else slots)
-    return ((name, getattr(value, name)) for name in names if hasattr(value, name))
+    names.pop("__dict__", None)
+    return tuple(names)
+
+
+def _is_frozen(cls: type) -> bool:
+    found: Any = cls  # the stub of dataclasses lacks the attribute
+    return bool(found.__dataclass_params__.frozen)
+
+
+def _is_map(cls: object) -> bool:
+    return isinstance(cls, type) and issubclass(cls, dict) and cls.__module__.startswith(_HOMES)
 
 
 # -- JSON → state ----------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
 from vram_arbiter.arbiter.core.events import Event
 from vram_arbiter.arbiter.core.settings import Settings
@@ -27,7 +26,6 @@ from vram_arbiter.arbiter.eventlog.logfile import (
     file_name,
     header_line,
 )
-from vram_arbiter.arbiter.eventlog.snapshot import freeze, thaw, to_plain
 from vram_arbiter.arbiter.host.disk_writer import DiskFailed, DiskWriter
 from vram_arbiter.schemas.plain import JsonMap
 
@@ -50,13 +48,13 @@ type Told = Callable[[str, JsonMap], object]
 
 @dataclass(frozen=True, slots=True)
 class _Begin:
-    """A new file from here on: its first line, with the state as `freeze` left it (None: empty)."""
+    """A new file from here on: its first line, with the state of that moment (None: empty)."""
 
     segment: int
     cause: str
     now: float
     at_wall_s: float
-    frozen: bytes | None
+    state: JsonMap | None
 
 
 type _Item = _Begin | tuple[float, Event, Sequence[Effect] | None]
@@ -76,12 +74,12 @@ class Recorder:
         *,
         max_bytes: int,
         file_bytes: int,
-        freeze_engine: Callable[[], bytes],
+        state: Callable[[], JsonMap],
         told: Told,
         clock: Callable[[], float] = time.monotonic,
         wall: Callable[[], float] = time.time,
     ) -> None:
-        self._freeze = freeze_engine
+        self._state = state
         self._told = told
         self._clock = clock
         self._wall = wall
@@ -127,15 +125,15 @@ class Recorder:
 
     def _begin_anew(self, cause: str, now: float) -> None:
         try:
-            frozen = self._freeze()
+            state = self._state()
         except Exception as error:  # noqa: BLE001 - it ends the recording, never the daemon
             self._stopped(f"the engine's state cannot be copied: {type(error).__name__}: {error}")
         else:
-            self._begin(cause, frozen, now)
+            self._begin(cause, state, now)
 
-    def _begin(self, cause: str, frozen: bytes | None, now: float) -> None:
+    def _begin(self, cause: str, state: JsonMap | None, now: float) -> None:
         self._segment += 1
-        self._put(_Begin(self._segment - 1, cause, now, self._wall(), frozen))
+        self._put(_Begin(self._segment - 1, cause, now, self._wall(), state))
 
     def _put(self, item: _Item) -> bool:
         """Keep an item, or stop: a log must not lack one in its middle."""
@@ -231,7 +229,7 @@ class _Files:
             at_wall_s=begin.at_wall_s,
             now=begin.now,
             settings=self._settings,
-            state=None if begin.frozen is None else to_plain(thaw(begin.frozen)),
+            state=begin.state,
         )
         line = header_line(header)
         path = self.folder / file_name(self._started_wall_s, self._settings.epoch, begin.segment)
@@ -272,8 +270,3 @@ class _Files:
         self._size += len(data)
         if self._size >= self._full_bytes:
             self.full_segment = self._segment
-
-
-def freezer(engine: Arbiter) -> Callable[[], bytes]:
-    """Return what a recorder copies the engine with."""
-    return lambda: freeze(engine)

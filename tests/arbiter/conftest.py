@@ -14,6 +14,6 @@ def busy() -> CoreDriver:
 
 
 @pytest.fixture
-def driver() -> CoreDriver:
-    """An engine with one simulated GPU of 8 GiB."""
-    return CoreDriver(8 * GIB)
+def driver(request: pytest.FixtureRequest) -> CoreDriver:
+    """An engine with one simulated GPU of 8 GiB, or as many as the test's module says (GPUS)."""
+    return CoreDriver(8 * GIB, gpus=getattr(request.module, "GPUS", 1))

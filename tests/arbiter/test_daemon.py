@@ -2,15 +2,12 @@
 processes."""
 
 import contextlib
-import json
 import os
 import re
 import signal
 import socket
 import subprocess
-import sys
-import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -234,61 +231,3 @@ def test_a_cap_and_a_reserve_from_the_file_are_the_budget(make_arbiter: Make) ->
         assert refused["error"]["code"] == "vram_insufficient"
         assert refused["error"]["details"]["capacity_bytes"] == 4 * GIB
         assert client.acquire("fits", 3 * GIB)["ok"]
-
-
-def test_the_log_as_json(make_arbiter: Make) -> None:
-    arbiter = make_arbiter(arguments=("--log-format", "json")).start()
-    arbiter.stop()
-    lines = [json.loads(line) for line in arbiter.log.splitlines()]
-    assert next(line["event"]["kind"] for line in lines if "event" in line) == "started"
-    assert lines[-1]["event"]["kind"] == "stopped"
-
-
-def test_a_core_that_fails_ends_the_daemon_with_70(make_arbiter: Make) -> None:
-    """A real daemon around a core with a defect: it says so, and decides nothing more."""
-    arbiter = make_arbiter()
-    script = """
-        import sys
-        import vram_arbiter.arbiter.daemon as daemon
-        from vram_arbiter.arbiter.__main__ import main
-        from vram_arbiter.arbiter.core.events import ClientConnected
-        from vram_arbiter.arbiter.core.invariants import InvariantViolation
-
-        class Defective(daemon.Arbiter):
-            def handle(self, event, now):
-                if isinstance(event, ClientConnected):
-                    raise InvariantViolation(1, "planted")
-                return super().handle(event, now)
-
-        daemon.Arbiter = Defective
-        sys.exit(main())
-    """
-    path = arbiter.runtime / "defective.py"
-    path.write_text(textwrap.dedent(script))
-    arbiter.program = [sys.executable, str(path)]
-    arbiter.start()
-    with WireClient(arbiter.endpoint) as client:
-        client.send("hello", name="n", instance="i")
-        assert arbiter.process is not None
-        assert arbiter.process.wait(PATIENCE_S) == 70
-    assert "invariant 1: planted" in arbiter.log
-    assert "state of the core: {" in arbiter.log
-
-
-def notes(reply: Mapping[str, object]) -> list[str]:
-    events = reply["events"]
-    assert isinstance(events, list)
-    return [event["kind"] for event in events]
-
-
-def test_history_and_subscription_over_the_wire(connect: Callable[..., WireClient]) -> None:
-    watcher, client = connect().hello("watcher", role="observer"), connect().hello()
-    assert watcher.ask("subscribe")["ok"]
-    lease = client.granted("detector", GIB)
-    event = watcher.push("event", where=lambda push: push["event"]["kind"] == "granted")["event"]
-    assert event["lease_id"] == lease["lease_id"]
-    history = client.ask("history", kinds=["started", "granted"])
-    assert notes(history) == ["started", "granted"]
-    assert (
-        client.ask("history", after=history["events"][0]["seq"], kinds=["started"])["events"] == []
-    )

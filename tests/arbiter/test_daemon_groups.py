@@ -71,11 +71,3 @@ def test_a_member_of_the_group_may_lease_and_only_operators_act_by_hand(make_arb
         "the lease was granted, no more"
     )
     assert speak(arbiter, "operator", operators, members)["ok"]
-
-
-def test_a_group_that_is_not_there_is_named(make_arbiter: Make) -> None:
-    arbiter = make_arbiter(arguments=("--group", "no-such-group"))
-    arbiter.spawn()
-    assert arbiter.process is not None
-    assert arbiter.process.wait(60) == 2
-    assert "wire.group: no group 'no-such-group'" in arbiter.log

@@ -17,7 +17,6 @@ from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 PATIENCE_S = 60
-GIB = 1 << 30
 UNSHARE = ["unshare", "--pid", "--fork", "--kill-child", "--mount-proc"]
 INSIDE = """
 import os, sys

@@ -12,7 +12,6 @@ from vram_arbiter.arbiter.eventlog import replay as runner
 from vram_arbiter.arbiter.eventlog.logfile import FOLDER
 
 pytestmark = pytest.mark.e2e
-PATIENCE_S = 60
 
 Make = Callable[..., ArbiterProcess]
 

@@ -22,7 +22,6 @@ from vram_arbiter.schemas.config.arbiter import LIVE_KEYS, ArbiterConfig, load_c
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.connection import Bounds
 
-GIB = 1 << 30
 FIRST = "limits: {leases_per_client_max: 2}\nlog: {level: info}\n"
 
 

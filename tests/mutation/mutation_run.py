@@ -30,6 +30,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any, NoReturn
@@ -38,6 +39,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = ROOT / "arbiter/core"
+IMPORTED = "/vram_arbiter/arbiter/core/"
+"""In the path of every file of the engine as it is imported: through the links of `src`."""
 TESTS = "tests/arbiter/core"
 KNOWN = Path(__file__).with_name("equivalent.json")
 TEST_TIMEOUT_S = 20
@@ -226,7 +229,7 @@ class Coverage:
         sys.monitoring.set_events(self._tool, sys.monitoring.events.LINE)
 
     def _line(self, code: CodeType, line: int) -> object:
-        if str(CORE) in code.co_filename:
+        if IMPORTED in code.co_filename:
             self._lines.add((Path(code.co_filename).stem, line))
         return sys.monitoring.DISABLE  # until the next test
 
@@ -298,6 +301,9 @@ class Trials:
             self.problem = f"{self._words(pid)} fails as it is; mend it first"
             return None
         tests, durations = json.loads(kept.read_text())
+        if not tests:
+            self.problem = "no test comes by a line of the engine"
+            return None
         return tests, durations
 
     def _run(
@@ -315,7 +321,7 @@ class Trials:
             ):
                 status = NO_EFFECT
                 os._exit(status)
-            for item, following in zip(items, [*items[1:], None], strict=True):
+            for item, following in zip_longest(items, items[1:]):
                 item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
                 if self.failed:
                     break

@@ -2,6 +2,7 @@
 same does not count."""
 
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -10,6 +11,7 @@ from typing import Any
 import pytest
 
 from tests.mutation import mutation_run as mutants_run
+from vram_arbiter.arbiter.core.model.state import Timers
 
 SOURCE = '''
 class Gate:
@@ -83,3 +85,24 @@ def test_only_the_very_change_that_was_judged_counts_as_equivalent() -> None:
     assert (report["killed"], report["survived"], report["equivalent"]) == (1, 1, 1)
     assert report["score"] == 0.5
     assert [survivor["diff"] for survivor in report["survivors"]] == ["-a\n+c"]
+
+
+def test_the_lines_that_a_test_comes_by_are_seen_though_the_engine_is_imported_by_links() -> None:
+    """No line was seen since the product is imported from `src`: every mutant ended in an error of
+    this tool, which counted as killed, and the score was always 100 %."""
+    coverage = mutants_run.Coverage()
+    try:
+        Timers().set(("ttl", "a"), 1.0)
+        coverage.pytest_runtest_logfinish("a test")
+    finally:
+        sys.monitoring.set_events(sys.monitoring.COVERAGE_ID, 0)
+        sys.monitoring.free_tool_id(sys.monitoring.COVERAGE_ID)
+    assert any(line.startswith("state:") for line in coverage.tests)
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")  # it forks on purpose
+def test_a_mutant_that_no_test_comes_by_survives(tmp_path: Path) -> None:
+    """As above: without tests the trial ended in an error."""
+    if not (pid := os.fork()):
+        mutants_run.Trials([], 1, tmp_path)._run([], None)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == mutants_run.SURVIVED

@@ -22,6 +22,19 @@ def held(
     return person, lease
 
 
+def in_use(driver: CoreDriver, name: str, gib: float, **spec: Any) -> tuple[Consumer, LeaseId]:
+    """A holder in the middle of its own use, and its lease."""
+    person, lease = held(driver, name, gib, **spec)
+    person.use_begin(lease)
+    return person, lease
+
+
+def give_back(driver: CoreDriver, person: Consumer, lease: LeaseId) -> None:
+    """Unload at a safe point, until the bytes are measured gone."""
+    person.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+
+
 def hidden_gpu(*, lists: bool = True, lag_s: float = 0.0) -> CoreDriver:
     """A GPU of 8 GiB as it is from the first reading on: with or without a list of processes, late
     by so much."""
@@ -56,14 +69,22 @@ def why(driver: CoreDriver, consumer: str) -> dict[str, Any]:
     return found
 
 
-def sent_away(
+def revoked(
     driver: CoreDriver, gib: float = 5, policy_gib: float = 5, **spec: Any
 ) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
-    """A detector on standby, and the policy that it left for, resident."""
+    """A detector that comes back from standby, revoked, and the policy that waits for its room."""
     det, lease = held(driver, "det", gib, standby=True, **spec)
     policy = driver.consumer("policy")
     wanted = policy.acquire(int(policy_gib * GIB))
     driver.until(lambda: driver.state(lease) == "revoking")
+    return det, lease, policy, wanted
+
+
+def sent_away(
+    driver: CoreDriver, gib: float = 5, policy_gib: float = 5, **spec: Any
+) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
+    """A detector on standby, and the policy that it left for, resident."""
+    det, lease, policy, wanted = revoked(driver, gib, policy_gib, **spec)
     det.unload(lease)
     driver.until(lambda: driver.state(wanted) == "loading")
     assert driver.state(lease) == "standby"

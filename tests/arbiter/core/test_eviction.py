@@ -1,7 +1,7 @@
 """The ladder: ask, ask again until heard, remind, deadline. Exact times, no sleep."""
 
 from tests.support.core_driver import CoreDriver
-from tests.support.scenes import held
+from tests.support.scenes import held, in_use
 from vram_arbiter.arbiter.core.events import ClientConnected
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ClientId
@@ -9,10 +9,8 @@ from vram_arbiter.schemas.ids import ClientId
 GIB = d.GIB
 
 
-def test_revoke_is_sent_again_until_acknowledged() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
+def test_revoke_is_sent_again_until_acknowledged(driver: CoreDriver) -> None:
+    det, lease = in_use(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     (first,) = driver.pushes("revoke")
     assert first == {
@@ -40,15 +38,13 @@ def test_revoke_is_sent_again_until_acknowledged() -> None:
     driver.advance(0.6)
     assert len(driver.pushes("revoke")) == 8, "at the safe point it is reminded until it unloads"
     det.unloading(lease)
-    driver.advance(0.6)
-    assert len(driver.pushes("revoke")) == 8
+    driver.advance(31.0)
+    assert len(driver.pushes("revoke")) == 8, "one that unloads is pushed nothing more, if late"
     assert driver.state(waiter) == "queued"
 
 
-def test_a_waiter_that_is_patient_waits_past_the_deadline() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
+def test_a_waiter_that_is_patient_waits_past_the_deadline(driver: CoreDriver) -> None:
+    det, lease = in_use(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     driver.advance(31.0)
     assert len(driver.notes("deadline_passed")) == 1
@@ -76,19 +72,19 @@ def test_a_holder_that_does_not_answer_at_the_deadline_no_longer_counts_as_leavi
     driver.until(lambda: driver.state(waiter) == "loading")
 
 
-def test_a_voluntary_release_while_asked_is_as_good() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_voluntary_release_while_asked_is_as_good(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     assert driver.state(lease) == "revoking"
+    asked_at = driver.arbiter.inspect().gpus[driver.device.gpu].asked_at
+    assert asked_at == driver.now, "a reading of before is under way"
     det.hold(0)
     det.release(lease)
     driver.until(lambda: driver.state(waiter) == "loading")
     assert driver.state(lease) == "over"
 
 
-def test_death_while_asked_counts_as_leaving() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_death_while_asked_counts_as_leaving(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     vlm = driver.consumer("vlm")
     waiter = vlm.acquire(5 * GIB)
@@ -102,8 +98,7 @@ def test_death_while_asked_counts_as_leaving() -> None:
 
 def test_a_reminder_between_two_pushes_pushes_nothing() -> None:
     driver = CoreDriver(8 * GIB, settings={"revoke_resend_s": 0.3})
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
+    in_use(driver, "det", 5)
     driver.consumer("vlm").acquire(5 * GIB)
     driver.advance(2.05)
     assert len(driver.pushes("revoke")) == 7

@@ -43,8 +43,7 @@ def test_a_crowd_that_waited_and_went_leaves_nothing_but_the_memory_of_the_last_
     assert core.gpus[driver.device.gpu].queue.head is None
 
 
-def test_consumers_of_ever_new_names_are_remembered_up_to_a_number() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_consumers_of_ever_new_names_are_remembered_up_to_a_number(driver: CoreDriver) -> None:
     core = state_of(driver.arbiter)
     for number in range(CONSUMERS_REMEMBERED + 10):
         core.costs.learn(f"c{number}", "load_s", 1.0)

@@ -104,6 +104,10 @@ def charged_for_ever(b: Broken) -> None:
     b.gpu.ledger.charge(LeaseId("x"), X, 1, 1, 0.0)
 
 
+def revoked_for_nothing(b: Broken) -> None:
+    force(b, b.held, LeaseState.REVOKING)
+
+
 def token_shrinks(b: Broken) -> None:
     b.core.turn.granted.append((Token(1, 1), GpuId("GPU-1")))
 
@@ -159,6 +163,7 @@ def away_and_held(b: Broken) -> None:
         (4, away_with_a_gpu, "it has a GPU"),
         (4, away_and_held, "it counts as away"),
         (6, no_next_reading, "is planned"),
+        (7, revoked_for_nothing, "nothing wants its bytes"),
     ],
 )
 @pytest.mark.parametrize("check", [invariants.check, full_check.check_all])

@@ -139,6 +139,7 @@ def test_an_unexplained_rest_counts_only_while_nobody_loads() -> None:
     )
     books.observe(sample(3.0, 150, (C, 100)), quiet=True)
     assert (books.unattributed_bytes, driver_bytes(books)) == (0, 50)
+    assert books.unlisted_bytes(sample(4.0, 350, (C, 100))) == 200, "the driver's own are known"
 
 
 def test_processes_without_byte_counts_are_taken_at_their_booking() -> None:

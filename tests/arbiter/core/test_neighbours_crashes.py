@@ -31,10 +31,9 @@ def crashed(driver: CoreDriver, times: int) -> None:
         crash(driver)
 
 
-def test_17_a_crash_loop_does_not_take_the_gpu_for_every_try() -> None:
+def test_17_a_crash_loop_does_not_take_the_gpu_for_every_try(driver: CoreDriver) -> None:
     """Berth's gateway backs off 15 s → 5 min with the same cause. Here the one that works stays,
     and the one that crashes is told why."""
-    driver = CoreDriver(8 * GIB)
     crashed(driver, 3)
     _, working = held(driver, "working", 5)
     again = driver.consumer("policy")
@@ -50,8 +49,7 @@ def test_17_a_crash_loop_does_not_take_the_gpu_for_every_try() -> None:
     assert driver.state(waiter) == "queued"
 
 
-def test_17_the_pause_grows_with_each_failure_and_has_a_bound() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_17_the_pause_grows_with_each_failure_and_has_a_bound(driver: CoreDriver) -> None:
     crashed(driver, 2)
     held(driver, "working", 3)
     pauses = []
@@ -75,8 +73,7 @@ def test_17_a_load_that_succeeds_or_time_forgets_it() -> None:
         assert not refusals_in(driver.consumer("policy").try_acquire(5 * GIB))
 
 
-def test_17_others_and_what_an_exclusive_one_or_a_queue_would_cost() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_17_others_and_what_an_exclusive_one_or_a_queue_would_cost(driver: CoreDriver) -> None:
     crashed(driver, 3)
     small, _ = held(driver, "small", 1)
     exclusive: dict[str, Any] = {"exclusive": True}

@@ -113,10 +113,9 @@ def test_a_load_peak_on_its_way_back_hides_nobodys_bytes(restarts: bool) -> None
     assert driver.gpu()["stowaway_bytes"] == 0
 
 
-def test_a_stowaway_that_has_gone_hides_nobodys_bytes() -> None:
+def test_a_stowaway_that_has_gone_hides_nobodys_bytes(driver: CoreDriver) -> None:
     """Its process is off the list before its bytes are off the GPU, which then nobody in the list
     explains."""
-    driver = CoreDriver(8 * GIB)
     small, lease = held(driver, "small", 1)
     driver.device.set(STRANGER, 2 * GIB, driver.now)
     driver.advance(2.0)

@@ -50,9 +50,8 @@ def test_a_leftover_falls_by_more_than_the_tolerance_or_not_at_all(less: int, af
 
 @pytest.mark.parametrize(("shown", "after"), [(0, 0), (1, 450 * MIB), (100 * MIB, 450 * MIB)])
 def test_only_who_is_neither_connected_nor_on_the_gpu_has_no_context(
-    shown: int, after: int
+    driver: CoreDriver, shown: int, after: int
 ) -> None:
-    driver = CoreDriver(8 * GIB)
     person = leftover(driver, 450 * MIB, 450 * MIB)
     person.hold(shown)
     driver.advance(3.0)
@@ -89,8 +88,7 @@ def test_a_reading_that_began_when_a_residue_was_charged_says_nothing_of_it() ->
         assert kept(driver, person) == after
 
 
-def test_what_a_dead_process_kept_is_measured_away_twice_as_any_bytes() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_what_a_dead_process_kept_is_measured_away_twice_as_any_bytes(driver: CoreDriver) -> None:
     person = leftover(driver, 450 * MIB, 450 * MIB)
     driver.device.silent = True
     person.die()
@@ -138,10 +136,9 @@ def test_who_grew_by_a_byte_is_named_and_who_did_not_is_not_the_largest_first() 
     assert culprits(driver) == [(pid, f"p{9 - pid}", grew[pid]) for pid in (5, 2, 4, 1)]
 
 
-def test_without_a_reading_from_before_only_strangers_are_named_and_with_all_that_they_hold() -> (
-    None
-):
-    driver = CoreDriver(8 * GIB)
+def test_without_a_reading_from_before_only_strangers_are_named_and_with_all_that_they_hold(
+    driver: CoreDriver,
+) -> None:
     det, _ = held(driver, "det", 3)
     held(driver, "other", 1)
     driver.device.failing = "the driver hangs"
@@ -155,8 +152,7 @@ def test_without_a_reading_from_before_only_strangers_are_named_and_with_all_tha
     assert culprits(driver) == [(9, "p0", 500 * MIB)]
 
 
-def test_a_process_without_a_figure_has_not_grown() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_process_without_a_figure_has_not_grown(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 4)
     det.unloading(lease)
     driver.advance(0.5)
@@ -216,26 +212,6 @@ def test_a_load_on_a_gpu_in_trouble_is_not_waited_for(trouble: str) -> None:
 
 
 # -- who has not come back
-@pytest.mark.parametrize("count", [1, 3, 4])
-def test_up_to_three_who_have_not_come_back_are_named(count: int) -> None:
-    driver = CoreDriver(8 * GIB)
-    people = [held(driver, f"m{n}", 1)[0] for n in range(count)]
-    driver.restart()
-    named = ", ".join(f"m{n} (pid {who.process.pid})" for n, who in enumerate(people[:3]))
-    more = " and 1 more" if count == 4 else ""
-    assert (
-        driver.gpu()["blocked"]["text"]
-        == f"recovering after a restart: {named}{more} must reattach first"
-    )
-
-
-def ready_with(member: tuple[Consumer, LeaseId], count: int, says: int | None = None) -> None:
-    """Loaded: it holds so much, and readings have seen it."""
-    who, lease = member
-    who.hold(count)
-    who.driver.advance(1.1)
-    who.ready(lease, count if says is None else says)
-    who.driver.advance(0.1)
 
 
 # -- residues in the journal
@@ -252,10 +228,9 @@ def restarted_with(driver: CoreDriver, person: Consumer, **changes: Any) -> None
     [(100 * MIB, 100 * MIB), (450 * MIB, 450 * MIB), (900 * MIB, 450 * MIB), (None, 450 * MIB)],
 )
 def test_a_residue_falls_after_a_restart_to_what_was_declared_of_it(
-    floor: int | None, after: int
+    driver: CoreDriver, floor: int | None, after: int
 ) -> None:
     """A record of an older daemon does not say: then all of it was."""
-    driver = CoreDriver(8 * GIB)
     person = leftover(driver, 450 * MIB, 450 * MIB)
     restarted_with(driver, person, floor_bytes=floor)
     assert kept(driver, person) == 450 * MIB
@@ -266,8 +241,7 @@ def test_a_residue_falls_after_a_restart_to_what_was_declared_of_it(
 
 
 @pytest.mark.parametrize("room", [450 * MIB, 450 * MIB - 1, 1, 0])
-def test_a_residue_of_the_journal_takes_what_room_there_is(room: int) -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_residue_of_the_journal_takes_what_room_there_is(driver: CoreDriver, room: int) -> None:
     _, lease = held(driver, "a", 1)
     person = leftover(driver, 450 * MIB, 450 * MIB)
     key = f"lease:{lease}"

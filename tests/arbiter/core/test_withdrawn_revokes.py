@@ -6,6 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.scenes import give_back, held, in_use, order
 from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.arbiter.core.model.lease import LeaseState
 from vram_arbiter.schemas import defaults as d
@@ -15,33 +16,16 @@ from vram_arbiter.schemas.wire.pushes import RevokePush, RevokeWithdrawnPush
 GIB = d.GIB
 
 
-def held(driver: CoreDriver, name: str, gib: float, **spec: object) -> tuple[Consumer, LeaseId]:
-    """A loaded holder."""
-    person = driver.consumer(name)
-    lease = person.acquire(int(gib * GIB), **spec)  # type: ignore[arg-type]
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    driver.advance(0.01)
-    return person, lease
-
-
 def revoked_in_use(
     driver: CoreDriver, **spec: object
 ) -> tuple[Consumer, LeaseId, Consumer, LeaseId]:
     """A holder in use that was revoked, and the waiter that it was revoked for."""
-    holder, lease = held(driver, "train", 5, **spec)
-    holder.use_begin(lease)
+    holder, lease = in_use(driver, "train", 5, **spec)
     waiter = driver.consumer("waiter")
     wanted = waiter.acquire(5 * GIB)
     driver.until(lambda: driver.state(lease) == "revoking")
     holder.ack(lease)
     return holder, lease, waiter, wanted
-
-
-def evict(driver: CoreDriver, lease: LeaseId) -> None:
-    """An operator's order."""
-    ops = driver.consumer("ops")
-    ops.order("evict", lease)
 
 
 LEAVES: dict[str, Callable[[CoreDriver, Consumer, LeaseId], object]] = {
@@ -52,10 +36,9 @@ LEAVES: dict[str, Callable[[CoreDriver, Consumer, LeaseId], object]] = {
 
 
 @pytest.mark.parametrize("how", LEAVES)
-def test_a_revoke_is_withdrawn_with_its_waiter(how: str) -> None:
+def test_a_revoke_is_withdrawn_with_its_waiter(driver: CoreDriver, how: str) -> None:
     """A holder in use stayed `revoking` for a waiter that was ended, unloaded at the end of its
     use, and the GPU stood empty with no waiter."""
-    driver = CoreDriver()
     holder, lease, waiter, wanted = revoked_in_use(driver)
     LEAVES[how](driver, waiter, wanted)
     assert driver.state(lease) == "held"
@@ -70,10 +53,8 @@ def test_a_revoke_is_withdrawn_with_its_waiter(how: str) -> None:
     assert not driver.notes("reminded")
 
 
-def test_a_revoke_is_withdrawn_where_the_wait_times_out() -> None:
-    driver = CoreDriver()
-    holder, lease = held(driver, "train", 5)
-    holder.use_begin(lease)
+def test_a_revoke_is_withdrawn_where_the_wait_times_out(driver: CoreDriver) -> None:
+    _, lease = in_use(driver, "train", 5)
     driver.consumer("hasty").acquire(5 * GIB, wait_timeout_s=3.0)
     driver.until(lambda: driver.state(lease) == "revoking")
     driver.until(lambda: bool(driver.notes("denied")))
@@ -100,22 +81,19 @@ def test_a_revoke_is_withdrawn_where_other_room_came_first() -> None:
     assert not granted["evicted"]
 
 
-def test_an_unload_that_has_begun_completes() -> None:
-    driver = CoreDriver()
+def test_an_unload_that_has_begun_completes(driver: CoreDriver) -> None:
     holder, lease, waiter, wanted = revoked_in_use(driver)
     holder.use_end(lease)
     holder.unloading(lease)
     waiter.cancel(wanted)
     assert driver.state(lease) == "unloading"
     assert not driver.pushes("revoke_withdrawn")
-    holder.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, holder, lease)
 
 
-def test_another_waiter_takes_the_eviction_over() -> None:
+def test_another_waiter_takes_the_eviction_over(driver: CoreDriver) -> None:
     """No withdrawal and no second acknowledgement: the holder is asked on, for the next in the
     queue, and its eviction is that one's."""
-    driver = CoreDriver()
     holder, lease, waiter, wanted = revoked_in_use(driver)
     later = driver.consumer("later")
     next_one = later.acquire(5 * GIB)
@@ -133,8 +111,7 @@ def test_another_waiter_takes_the_eviction_over() -> None:
     assert granted["evicted"] == ["train"]
 
 
-def test_only_what_another_waiter_needs_stays_revoked() -> None:
-    driver = CoreDriver()
+def test_only_what_another_waiter_needs_stays_revoked(driver: CoreDriver) -> None:
     one, first = held(driver, "one", 3)
     two, second = held(driver, "two", 4)
     one.use_begin(first)
@@ -155,20 +132,17 @@ def test_only_what_another_waiter_needs_stays_revoked() -> None:
     driver.until(lambda: driver.state(little) == "loading")
 
 
-def test_an_operators_order_stands() -> None:
-    driver = CoreDriver()
+def test_an_operators_order_stands(driver: CoreDriver) -> None:
     holder, lease, waiter, wanted = revoked_in_use(driver)
-    evict(driver, lease)
+    order(driver, "evict", lease)
     waiter.cancel(wanted)
     driver.advance(1.0)
     assert driver.state(lease) == "revoking"
     holder.use_end(lease)
-    holder.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, holder, lease)
 
 
-def test_a_revoke_for_pressure_ends_with_the_pressure() -> None:
-    driver = CoreDriver()
+def test_a_revoke_for_pressure_ends_with_the_pressure(driver: CoreDriver) -> None:
     _, lease = held(driver, "train", 5)
     stranger = driver.consumer("stranger")
     stranger.leave()
@@ -195,18 +169,16 @@ def test_a_release_that_crosses_the_withdrawal_is_that_of_an_eviction() -> None:
     assert parked["comes_back"]
 
 
-def test_a_release_long_after_the_withdrawal_is_the_holders_own() -> None:
+def test_a_release_long_after_the_withdrawal_is_the_holders_own(driver: CoreDriver) -> None:
     """A holder that used its lease since has heard that it may stay. What it releases then is not
     granted again by itself: a holder without a client library of ours does not expect that."""
-    driver = CoreDriver()
     holder, lease, waiter, wanted = revoked_in_use(driver, standby=True)
     waiter.cancel(wanted)
     holder.use_end(lease)
     holder.use_begin(lease)
     holder.use_end(lease)
     driver.advance(60.0)
-    holder.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, holder, lease)
 
 
 def test_a_withdrawn_holder_keeps_its_place_among_residents() -> None:
@@ -224,16 +196,14 @@ def test_a_withdrawn_holder_keeps_its_place_among_residents() -> None:
     assert ready == sorted(ready)
 
 
-def test_a_grant_names_only_evictions_that_were_asked_for_it() -> None:
+def test_a_grant_names_only_evictions_that_were_asked_for_it(driver: CoreDriver) -> None:
     """134 s after an eviction for a waiter that had gone, a grant on the empty GPU said «fits after
     train left» and a switch of 762 s."""
-    driver = CoreDriver()
     holder, lease, waiter, wanted = revoked_in_use(driver)
     holder.use_end(lease)
     holder.unloading(lease)
     waiter.cancel(wanted)
-    holder.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, holder, lease)
     driver.advance(134.0)
     _, latecomer = held(driver, "late", 5)
     (granted,) = [note for note in driver.notes("granted") if note["lease_id"] == latecomer]
@@ -259,12 +229,10 @@ def test_a_waiter_that_leaves_before_its_grant_leaves_no_eviction_behind() -> No
     assert not gpu.evictions
 
 
-def test_an_operators_eviction_makes_no_switch() -> None:
-    driver = CoreDriver()
+def test_an_operators_eviction_makes_no_switch(driver: CoreDriver) -> None:
     holder, lease = held(driver, "train", 5)
-    evict(driver, lease)
-    holder.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    order(driver, "evict", lease)
+    give_back(driver, holder, lease)
     _, later = held(driver, "later", 5)
     (granted,) = [note for note in driver.notes("granted") if note["lease_id"] == later]
     assert not granted["evicted"]
@@ -276,8 +244,7 @@ def test_of_two_gpus_emptied_for_one_waiter_each_holder_is_told_once() -> None:
     driver = CoreDriver(gpus=2)
     leases: list[LeaseId] = []
     for name, gpu in (("one", "0"), ("two", "1")):
-        holder, lease = held(driver, name, 5, gpu=gpu)
-        holder.use_begin(lease)
+        _, lease = in_use(driver, name, 5, gpu=gpu)
         leases.append(lease)
     waiter, later = driver.consumer("waiter"), driver.consumer("later")
     wanted = waiter.acquire(5 * GIB)
@@ -295,32 +262,38 @@ def test_of_two_gpus_emptied_for_one_waiter_each_holder_is_told_once() -> None:
     assert [driver.state(lease) for lease in leases] == ["revoking", "held"]
 
 
-def drain(driver: CoreDriver) -> None:
-    ops = driver.consumer("ops")
-    ops.order("drain")
-
-
-def test_on_a_gpu_that_grants_nothing_a_revoke_is_withdrawn_too() -> None:
+def test_on_a_gpu_that_grants_nothing_a_revoke_is_withdrawn_too(driver: CoreDriver) -> None:
     """A drain lasts as long as its operator wants."""
-    driver = CoreDriver()
     _, lease, waiter, wanted = revoked_in_use(driver)
     small = driver.consumer("small").acquire(GIB)
     assert driver.state(small) == "loading", "backfilled"
-    drain(driver)
+    driver.consumer("ops").order("drain")
     waiter.cancel(wanted)
     assert driver.state(lease) == "held"
 
 
-def test_on_a_gpu_that_grants_nothing_the_next_waiter_takes_over() -> None:
+def test_on_a_gpu_that_grants_nothing_the_next_waiter_takes_over(driver: CoreDriver) -> None:
     """It kept the name of the waiter that was gone."""
-    driver = CoreDriver()
     _, lease, waiter, wanted = revoked_in_use(driver)
     driver.consumer("later").acquire(5 * GIB)
-    drain(driver)
+    driver.consumer("ops").order("drain")
     waiter.cancel(wanted)
     assert driver.state(lease) == "revoking"
     assert not driver.pushes("revoke_withdrawn")
     assert driver.pushes("revoke", lease)[-1]["wanted_by"] == "later"
+
+
+def test_on_a_gpu_that_grants_nothing_a_waiter_placed_elsewhere_takes_nothing_over() -> None:
+    driver = CoreDriver(gpus=2)
+    _, first = in_use(driver, "one", 5, gpu="0", priority=10)
+    _, second = in_use(driver, "two", 5, gpu="1", priority=20)
+    driver.consumer("anywhere").acquire(5 * GIB)
+    waiter = driver.consumer("waiter")
+    wanted = waiter.acquire(5 * GIB, gpu="1")
+    driver.until(lambda: driver.state(second) == "revoking")
+    driver.consumer("ops").order("drain")
+    waiter.cancel(wanted)
+    assert (driver.state(first), driver.state(second)) == ("revoking", "held")
 
 
 def test_a_lease_that_waits_again_does_not_inherit_its_earlier_evictions() -> None:
@@ -328,8 +301,7 @@ def test_a_lease_that_waits_again_does_not_inherit_its_earlier_evictions() -> No
     hung in its unload, was booked to the grant of the next one."""
     driver = CoreDriver()
     det, lease = held(driver, "det", 3, standby=True)
-    hanging, stuck = held(driver, "hanging", 3, priority=40)
-    hanging.use_begin(stuck)
+    hanging, stuck = in_use(driver, "hanging", 3, priority=40)
     evictor = driver.consumer("evictor")
     first = evictor.acquire(3 * GIB, priority=30)
     driver.until(lambda: driver.state(lease) == "revoking")

@@ -8,7 +8,6 @@ import pytest
 
 from tests.support.core_driver import CoreDriver
 from tests.support.recording import write_log
-from tests.support.scenes import held
 from vram_arbiter.arbiter.eventlog import replay as runner
 from vram_arbiter.arbiter.eventlog import text
 from vram_arbiter.arbiter.eventlog.logfile import LogError
@@ -31,29 +30,6 @@ def test_a_run_is_repeated_byte_for_byte(busy: CoreDriver, log: Path) -> None:
     found = runner.replay(runner.load(log))
     assert (found.identical, found.events, found.same_engine) == (True, len(busy.events), True)
     assert text.replay_lines(found)[-1].startswith(f"{len(busy.events)} events, identical (1 file")
-
-
-def test_a_restart_with_users_that_come_back_or_do_not_is_repeated(tmp_path: Path) -> None:
-    driver = CoreDriver()
-    sidecar, lease = held(driver, "sidecar", 5, ttl_s=20.0)
-    token = sidecar.token(lease)
-    robot, watcher = driver.consumer("runner"), driver.consumer("watcher")
-    for user in (robot, watcher):
-        user.use_begin(lease, "goal", token)
-    before, made_at = len(driver.events), driver.now
-    driver.restart()
-    sidecar.connect()
-    sidecar.reattach(lease, token)
-    robot.connect()
-    robot.use_begin(lease, "goal", token)
-    for _ in range(2):
-        driver.advance(15.0)
-        sidecar.renew((lease, token))
-    robot.use_end(lease, "goal", token)
-    del driver.events[:before]
-    found = runner.replay(runner.load(write_log(driver, tmp_path, made_at=made_at)))
-    assert (found.identical, found.events) == (True, len(driver.events))
-    assert [note["use_id"] for note in driver.notes("use_ended")] == ["goal", "goal"]
 
 
 def test_the_first_divergence_is_shown_with_its_surroundings(log: Path) -> None:

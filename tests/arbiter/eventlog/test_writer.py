@@ -4,6 +4,7 @@ crash. Real threads and files."""
 import asyncio
 import json
 from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,8 @@ from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.eventlog import replay as runner
 from vram_arbiter.arbiter.eventlog import writer as module
 from vram_arbiter.arbiter.eventlog.logfile import FOLDER, LogError, header_line
-from vram_arbiter.arbiter.eventlog.writer import Recorder, freezer
-from vram_arbiter.arbiter.host.disk_writer import FLUSH_S
+from vram_arbiter.arbiter.eventlog.snapshot import to_plain
+from vram_arbiter.arbiter.eventlog.writer import Recorder
 from vram_arbiter.schemas import defaults as d
 
 PATIENCE_S = 60.0
@@ -39,7 +40,7 @@ class Recorded:
             "0.1",
             max_bytes=bounds.get("max_bytes", 8 * d.MIB),
             file_bytes=bounds.get("file_bytes", d.MIB),
-            freeze_engine=freezer(self.engine),
+            state=partial(to_plain, self.engine),
             told=self._told,
             clock=lambda: self.clock,
         )
@@ -87,20 +88,6 @@ def test_what_was_recorded_replays_identically(busy: CoreDriver, tmp_path: Path)
         found = recorded.replayed()
         assert (found.identical, found.events) == (True, count)
         assert recorded.files()[0].stat().st_mode & 0o777 == 0o600
-
-    recording(test)
-
-
-def test_events_reach_the_disk_by_themselves(busy: CoreDriver, tmp_path: Path) -> None:
-    async def test() -> None:
-        recorded = Recorded(busy, tmp_path)
-        recorded.go(3)
-        async with asyncio.timeout(PATIENCE_S):
-            while sum(len(path.read_text().splitlines()) for path in recorded.folder.glob("*")) < 4:
-                await asyncio.sleep(FLUSH_S / 4)
-        recorded.recorder.close()
-        found = recorded.replayed()
-        assert (found.identical, found.events) == (True, 3)
 
     recording(test)
 

@@ -33,9 +33,9 @@ WITHDRAWN = RevokeWithdrawnPush("L1-1", Token(1, 2))
 class Recorder:
     """Writes down, in order, whatever is done."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, disk_full: bool = False) -> None:
         self.done: list[tuple[Any, ...]] = []
-        self.disk_full = False
+        self.disk_full = disk_full
         self.executor = Executor(
             self, self, self, self.sample, self.post, self.log_event, self.signal, words
         )
@@ -108,8 +108,7 @@ def test_answers_go_out_in_order_then_facts_then_readings() -> None:
 
 
 def test_a_grant_that_cannot_be_written_is_not_sent() -> None:
-    recorder = Recorder()
-    recorder.disk_full = True
+    recorder = Recorder(disk_full=True)
     recorder.executor.perform(
         [
             fx.JournalPut("lease:L1-1", RECORD, gates=True),
@@ -131,8 +130,7 @@ def test_a_grant_that_cannot_be_written_is_not_sent() -> None:
 def test_what_was_said_of_a_lease_before_its_grant_is_said_though_that_cannot_be_written() -> None:
     """Records are written first, for all that the batch says; it still waits for what came after
     the grant only."""
-    recorder = Recorder()
-    recorder.disk_full = True
+    recorder = Recorder(disk_full=True)
     recorder.executor.perform(
         [
             fx.JournalPut("lease:L1-0", RECORD),
@@ -153,8 +151,7 @@ def test_what_was_said_of_a_lease_before_its_grant_is_said_though_that_cannot_be
 def test_what_has_happened_is_told_though_its_record_cannot_be_written() -> None:
     """Regression: with a full disk a release was refused and missing in the history although it had
     taken place."""
-    recorder = Recorder()
-    recorder.disk_full = True
+    recorder = Recorder(disk_full=True)
     recorder.executor.perform(
         [
             fx.JournalPut("lease:L1-1", RECORD),
@@ -172,16 +169,14 @@ def test_what_has_happened_is_told_though_its_record_cannot_be_written() -> None
 
 
 def test_a_record_that_cannot_be_deleted_stops_nobody() -> None:
-    recorder = Recorder()
-    recorder.disk_full = True
+    recorder = Recorder(disk_full=True)
     recorder.executor.perform([fx.JournalDelete("lease:L1-1"), fx.Reply(A, ONE, LEASE)])
     assert recorder.done == [("reply", A, ONE, LEASE)]
 
 
 def test_a_record_that_a_full_disk_could_not_delete_goes_with_the_next_write() -> None:
     """Regression: it stayed for ever, and every restart recovered a lease that nobody had."""
-    recorder = Recorder()
-    recorder.disk_full = True
+    recorder = Recorder(disk_full=True)
     recorder.executor.perform(
         [fx.JournalDelete("lease:L1-1"), fx.JournalDelete("residue:1@1:GPU-1")]
     )
@@ -195,8 +190,7 @@ def test_a_record_that_a_full_disk_could_not_delete_goes_with_the_next_write() -
 
 
 def test_a_record_that_is_written_again_is_not_deleted_later() -> None:
-    recorder = Recorder()
-    recorder.disk_full = True
+    recorder = Recorder(disk_full=True)
     recorder.executor.perform([fx.JournalDelete("residue:1@1:GPU-1")])
     recorder.executor.perform([fx.JournalPut("residue:1@1:GPU-1", RECORD)])
     recorder.disk_full = False
@@ -205,8 +199,7 @@ def test_a_record_that_is_written_again_is_not_deleted_later() -> None:
 
 
 def test_what_is_owed_is_deleted_without_a_further_change() -> None:
-    recorder = Recorder()
-    recorder.disk_full = True
+    recorder = Recorder(disk_full=True)
     recorder.executor.perform([fx.JournalDelete("lease:L1-1")])
     recorder.executor.settle()
     assert recorder.done == [], "the disk is no better yet"

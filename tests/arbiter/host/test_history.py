@@ -153,31 +153,6 @@ def test_number_and_age_are_bounded(tmp_path: Path) -> None:
     store.close()
 
 
-WILD = (1e9, 0.0, 4e9, -1e6, 1e9, 1e12, 5.0)
-"""A clock without a battery: 2001, 1970, 2096, before the epoch, back, far away, 1970."""
-
-
-def test_a_wild_wall_clock_only_dates_events(tmp_path: Path) -> None:
-    """Numbers, order and what is kept follow the run, not the clock that is set meanwhile."""
-    clock = iter(WILD)
-
-    async def run() -> None:
-        history = History.open(tmp_path, 100_000, 7.0, lambda: next(clock))
-        history.start(asyncio.get_running_loop())
-        for number in range(len(WILD)):
-            history.append("x", {"number": number})
-        found = (await read(history)).events
-        assert [(e["seq"], e["number"], e["at_wall_s"]) for e in found] == [
-            (number + 1, number, at) for number, at in enumerate(WILD)
-        ]
-        history.close()
-
-    asyncio.run(run())
-    store = module._Store(tmp_path / "history.sqlite", 100_000, 7.0, time.time)
-    assert len(store.find(0, 100, ())) == len(WILD)
-    store.close()
-
-
 def test_a_clock_that_is_set_by_decades_does_not_empty_the_history_of_this_run(
     tmp_path: Path,
 ) -> None:

@@ -138,47 +138,39 @@ def test_records_that_nobody_understands_are_put_aside_in_the_same_epoch(tmp_pat
     )
 
 
-def test_what_was_learnt_survives_a_boot_and_nonsense_is_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "kept", "nonsense"),
+    [
+        ("learnt", {"detector": {"load_s": 2.5}}, '{"a": {"b": "c"}}'),
+        ("footprints", {"detector m@1": {"load_peak": [5, 6], "oom": [9, 20]}}, '{"a": {"b": 1}}'),
+    ],
+)
+def test_what_was_learnt_survives_a_boot_and_a_journal_that_is_put_aside(
+    tmp_path: Path, name: Any, kept: Any, nonsense: str
+) -> None:
     journal = Journal.open(tmp_path, "boot-1")
-    assert journal.opened.learnt == {}
-    journal.keep("learnt", {"detector": {"load_s": 2.5}})
-    journal.close()
-    assert Journal.open(tmp_path, "boot-2").opened.learnt == {"detector": {"load_s": 2.5}}
-    for nonsense in ("[1]", "{", '{"a": {"b": "c"}}', '{"a": 1}'):
-        edit(
-            tmp_path / "journal.sqlite",
-            f"UPDATE meta SET value = '{nonsense}' WHERE name = 'learnt'",
-        )
-        found = opened(tmp_path, "boot-2")
-        assert (found.learnt, found.put_aside) == ({}, None)
-
-
-def test_footprints_survive_a_boot_and_a_journal_that_is_put_aside(tmp_path: Path) -> None:
-    journal = Journal.open(tmp_path, "boot-1")
-    kept = {"detector m@1": {"load_peak": [5, 6], "oom": [9, 20]}}
-    journal.keep("footprints", kept)
-    journal.keep("footprints", kept)
+    assert getattr(journal.opened, name) == {}
+    journal.keep(name, kept)
+    journal.keep(name, kept)
     journal.close()
     journal = Journal.open(tmp_path, "boot-2")
-    assert journal.opened.footprints == kept
+    assert getattr(journal.opened, name) == kept
     journal.put_aside("KeyError: 'spec'")
-    assert journal.opened.footprints == kept, "for this run; it will be kept again"
+    assert getattr(journal.opened, name) == kept, "for this run; it will be kept again"
     journal.close()
-    for nonsense in ("[1]", "{", '{"a": {"b": "c"}}', '{"a": {"b": 1}}', '{"a": 1}'):
-        edit(
-            tmp_path / "journal.sqlite",
-            f"INSERT OR REPLACE INTO meta VALUES ('footprints', '{nonsense}')",
-        )
+    for text in ("[1]", "{", nonsense, '{"a": 1}'):
+        statement = f"INSERT OR REPLACE INTO meta VALUES ('{name}', '{text}')"
+        edit(tmp_path / "journal.sqlite", statement)
         found = opened(tmp_path, "boot-2")
-        assert (found.footprints, found.put_aside) == ({}, None)
+        assert (getattr(found, name), found.put_aside) == ({}, None)
 
 
-def test_a_write_that_writes_nothing_proves_nothing(tmp_path: Path) -> None:
-    """A full disk lets an empty transaction pass."""
+def test_a_write_that_fails_is_typed_and_writes_nothing(tmp_path: Path) -> None:
+    """A full disk lets an empty transaction pass: that proves nothing."""
     journal = Journal.open(tmp_path, "boot-1")
     blocker = sqlite3.connect(tmp_path / "journal.sqlite", isolation_level=None)
     blocker.execute("BEGIN IMMEDIATE")
-    with pytest.raises(JournalUnavailable):
+    with pytest.raises(JournalUnavailable, match="locked"):
         journal.apply([("lease:L1-1", {"a": 1})])
     journal.settle()
     assert "nothing new is granted" in journal.problem, "the disk is no better yet"
@@ -188,17 +180,6 @@ def test_a_write_that_writes_nothing_proves_nothing(tmp_path: Path) -> None:
     assert journal.problem
     journal.settle()
     assert journal.problem == ""
-    journal.close()
-
-
-def test_a_write_that_fails_is_typed_and_writes_nothing(tmp_path: Path) -> None:
-    journal = Journal.open(tmp_path, "boot-1")
-    blocker = sqlite3.connect(tmp_path / "journal.sqlite", isolation_level=None)
-    blocker.execute("BEGIN IMMEDIATE")
-    with pytest.raises(JournalUnavailable, match="locked"):
-        journal.apply([("lease:L1-1", {"a": 1})])
-    blocker.execute("ROLLBACK")
-    blocker.close()
     journal.apply([("lease:L1-2", {"a": 1})])
     journal.close()
     assert set(Journal.open(tmp_path, "boot-1").opened.records) == {"lease:L1-2"}

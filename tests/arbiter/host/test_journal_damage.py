@@ -165,25 +165,6 @@ def test_a_power_cut_is_not_doubted(tmp_path: Path, cut: str) -> None:
     assert (found.records, found.doubt) == ({}, "")
 
 
-def test_a_database_of_an_earlier_version_is_put_aside(tmp_path: Path) -> None:
-    """Version 0.1 wrote no digests. Its clients speak another wire and could not reattach; what
-    they hold gets its time, and is a stowaway then."""
-    with contextlib.closing(sqlite3.connect(tmp_path / DATABASE)) as connection, connection:
-        connection.execute(
-            "CREATE TABLE meta (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID"
-        )
-        connection.execute(
-            "CREATE TABLE records (key TEXT PRIMARY KEY, json TEXT NOT NULL) WITHOUT ROWID"
-        )
-        rows = [("schema", "1"), ("boot_id", "boot-1"), ("epoch", "7")]
-        connection.executemany("INSERT INTO meta VALUES (?, ?)", rows)
-        connection.execute("INSERT INTO records VALUES ('a', '{\"n\": 1}')")
-    found = opened(tmp_path, at_least=8)
-    assert (found.epoch, set(found.records)) == (8, {DOUBT_KEY})
-    assert found.put_aside is not None
-    assert "schema 1, this daemon knows 2" in found.doubt
-
-
 # -- kills
 class Watched(Seal):
     """A seal that copies the whole folder before and after each write: what a SIGKILL at that

@@ -14,10 +14,12 @@ from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime.procfs import start_ticks
 
 PATIENCE_S = 60.0
+Programs = Callable[[], "subprocess.Popen[bytes]"]
+Died = "asyncio.Queue[ProcessKey]"
 
 
 @pytest.fixture
-def idle_programs() -> Iterator[Callable[[], "subprocess.Popen[bytes]"]]:
+def idle_programs() -> Iterator[Programs]:
     """Makes processes that wait for their stdin to close."""
     made: list[subprocess.Popen[bytes]] = []
 
@@ -38,7 +40,7 @@ def key_of(child: "subprocess.Popen[bytes]") -> ProcessKey:
     return ProcessKey(child.pid, ticks)
 
 
-def watching(test: Callable[[ProcessWatch, "asyncio.Queue[ProcessKey]"], Awaitable[None]]) -> None:
+def watching(test: Callable[[ProcessWatch, Died], Awaitable[None]]) -> None:
     async def run() -> None:
         died: asyncio.Queue[ProcessKey] = asyncio.Queue()
         watch = ProcessWatch(asyncio.get_running_loop(), start_ticks, died.put_nowait)
@@ -61,13 +63,11 @@ def watched() -> int:
     return sum("pidfd" in link for link in found)
 
 
-def test_a_process_is_watched_by_the_descriptor_of_its_connection(
-    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
-) -> None:
+def test_a_process_is_watched_by_the_descriptor_of_its_connection(idle_programs: Programs) -> None:
     """Between a connection's accept and its hello the process may die and its pid be reused: the
     pidfd still names the first one."""
 
-    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+    async def test(watch: ProcessWatch, died: Died) -> None:
         child = idle_programs()
         key, pidfd = key_of(child), os.pidfd_open(child.pid)
         child.kill()
@@ -83,10 +83,8 @@ def test_a_process_is_watched_by_the_descriptor_of_its_connection(
     watching(test)
 
 
-def test_a_process_that_is_dropped_is_not_reported(
-    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
-) -> None:
-    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+def test_a_process_that_is_dropped_is_not_reported(idle_programs: Programs) -> None:
+    async def test(watch: ProcessWatch, died: Died) -> None:
         dropped, other = idle_programs(), idle_programs()
         before = watched()
         watch.add(key_of(dropped))
@@ -104,10 +102,8 @@ def test_a_process_that_is_dropped_is_not_reported(
     watching(test)
 
 
-def test_a_killed_process_is_reported_once_before_it_is_reaped(
-    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
-) -> None:
-    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+def test_a_killed_process_is_reported_once_before_it_is_reaped(idle_programs: Programs) -> None:
+    async def test(watch: ProcessWatch, died: Died) -> None:
         child, other = idle_programs(), idle_programs()
         watch.add(key_of(child))
         watch.add(key_of(child))
@@ -123,9 +119,9 @@ def test_a_killed_process_is_reported_once_before_it_is_reaped(
 
 
 def test_a_process_that_is_dead_already_is_reported_but_not_from_inside_add(
-    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
+    idle_programs: Programs,
 ) -> None:
-    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+    async def test(watch: ProcessWatch, died: Died) -> None:
         child = idle_programs()
         key = key_of(child)
         child.kill()
@@ -139,10 +135,8 @@ def test_a_process_that_is_dead_already_is_reported_but_not_from_inside_add(
     watching(test)
 
 
-def test_a_reused_pid_is_the_death_of_the_one_that_was_meant(
-    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
-) -> None:
-    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+def test_a_reused_pid_is_the_death_of_the_one_that_was_meant(idle_programs: Programs) -> None:
+    async def test(watch: ProcessWatch, died: Died) -> None:
         child = idle_programs()
         earlier = ProcessKey(child.pid, key_of(child).start_ticks - 100)
         watch.add(earlier)
@@ -152,10 +146,8 @@ def test_a_reused_pid_is_the_death_of_the_one_that_was_meant(
     watching(test)
 
 
-def test_an_unknown_start_time_is_watched_by_pid(
-    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
-) -> None:
-    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+def test_an_unknown_start_time_is_watched_by_pid(idle_programs: Programs) -> None:
+    async def test(watch: ProcessWatch, died: Died) -> None:
         child = idle_programs()
         watch.add(ProcessKey(child.pid, 0))
         child.kill()
@@ -164,10 +156,8 @@ def test_an_unknown_start_time_is_watched_by_pid(
     watching(test)
 
 
-def test_no_descriptor_is_left_behind(
-    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
-) -> None:
-    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+def test_no_descriptor_is_left_behind(idle_programs: Programs) -> None:
+    async def test(watch: ProcessWatch, died: Died) -> None:
         made = [idle_programs() for _ in range(5)]
         keys = [key_of(child) for child in made]
         before = watched()
@@ -188,12 +178,12 @@ def test_no_descriptor_is_left_behind(
 
 @pytest.mark.parametrize(("kind", "number"), [("term", signal.SIGTERM), ("kill", signal.SIGKILL)])
 def test_a_signal_goes_through_the_descriptor(
-    idle_programs: Callable[[], "subprocess.Popen[bytes]"], kind: str, number: signal.Signals
+    idle_programs: Programs, kind: str, number: signal.Signals
 ) -> None:
     child = idle_programs()
     key = key_of(child)
 
-    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+    async def test(watch: ProcessWatch, died: Died) -> None:
         watch.add(key)
         watch.signal(key, kind)
         assert await died.get() == key
@@ -202,12 +192,10 @@ def test_a_signal_goes_through_the_descriptor(
     assert child.wait(PATIENCE_S) == -number
 
 
-def test_whoever_is_not_watched_or_not_surely_known_gets_no_signal(
-    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
-) -> None:
+def test_whoever_is_not_watched_or_not_surely_known_gets_no_signal(idle_programs: Programs) -> None:
     child = idle_programs()
 
-    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+    async def test(watch: ProcessWatch, died: Died) -> None:
         watch.signal(key_of(child), "kill")
         unsure = ProcessKey(child.pid, 0)
         watch.add(unsure)
@@ -220,12 +208,10 @@ def test_whoever_is_not_watched_or_not_surely_known_gets_no_signal(
     assert child.wait(PATIENCE_S) == -signal.SIGKILL
 
 
-def test_a_signal_that_comes_too_late_is_no_error(
-    idle_programs: Callable[[], "subprocess.Popen[bytes]"],
-) -> None:
+def test_a_signal_that_comes_too_late_is_no_error(idle_programs: Programs) -> None:
     child = idle_programs()
 
-    async def test(watch: ProcessWatch, died: "asyncio.Queue[ProcessKey]") -> None:
+    async def test(watch: ProcessWatch, died: Died) -> None:
         key = key_of(child)
         watch.add(key)
         child.kill()

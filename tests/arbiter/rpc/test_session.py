@@ -201,17 +201,6 @@ def test_another_version_is_refused(session_bench: Bench) -> None:
     assert len(session_bench.table) == 0
 
 
-def test_a_sub_lease_is_an_unknown_field(session_bench: Bench) -> None:
-    """Sub-leases went with version 2 of the wire: a spec that still names a parent is refused, not
-    granted as a lease of its own."""
-    session_bench.hello()
-    spec = {"consumer": "c", "model_id": "m", "footprint": FOOTPRINT}
-    parent = {"lease_id": "L1-1", "token": [1, 1]}
-    reply = session_bench.ask("acquire", nonce="n", spec={**spec, "parent": parent})
-    assert code(reply) == "bad_request"
-    assert "parent" in str(reply["error"])
-
-
 def test_a_peer_that_cannot_be_seen_is_refused(session_bench: Bench) -> None:
     """The kernel says pid 0 of a process of another pid namespace: its death would be heard by
     nothing."""
@@ -246,22 +235,6 @@ def test_roles(session_bench: Bench) -> None:
         ("cancel", {"lease_id": "L"}),
     ):
         assert code(session_bench.ask(op, b"v", **fields)) == "not_permitted"
-
-
-def test_requests_of_leases_that_come_back(session_bench: Bench) -> None:
-    session_bench.hello()
-    session_bench.events.clear()
-    me, token, on = session_bench.client(), Token(3, 7), {"lease_id": "L3-1", "token": [3, 7]}
-    wanted = {"consumer": "detector", "model_id": "m", "footprint": FOOTPRINT, "standby": True}
-    session_bench.ask("reacquire", **on, wait_timeout_s=4.0)
-    session_bench.ask("reattach", leases=[{**on, "spec": wanted, "state": "standby"}])
-    reacquired, reattached = session_bench.events
-    asked = RequestId(session_bench.next_id - 1)
-    assert reacquired == ev.Asked(me, asked, wire.Reacquire(LEASE, token, 4.0))
-    assert isinstance(reattached, ev.Asked)
-    assert isinstance(reattached.request, wire.Reattach)
-    (item,) = reattached.request.leases
-    assert (item.state, item.spec.standby) == ("standby", True)
 
 
 def test_every_request_on_leases_comes_to_the_engine(session_bench: Bench) -> None:

@@ -3,6 +3,7 @@
 import pytest
 
 from tests.support.core_driver import CoreDriver, refusal
+from tests.support.scenes import held, in_use, shown
 from vram_arbiter.arbiter.core.effects import Sample
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, LeaseId
@@ -32,8 +33,7 @@ def lived(
 
 
 def charge(driver: CoreDriver, lease: LeaseId) -> float:
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     return float(view["charge_bytes"] / GIB)
 
 
@@ -42,8 +42,7 @@ def learnt(driver: CoreDriver, consumer: str) -> dict[str, float]:
     return {part: count / GIB for part, count in lease["footprint"]["learnt_bytes"].items()}
 
 
-def test_the_next_load_is_charged_what_the_last_ones_took() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_the_next_load_is_charged_what_the_last_ones_took(driver: CoreDriver) -> None:
     lived(driver, "det", peak=4, steady=3, residue=0.5)
     det = driver.consumer("det")
     lease = det.acquire(2 * GIB, residue_bytes=450 * MIB)
@@ -54,20 +53,17 @@ def test_the_next_load_is_charged_what_the_last_ones_took() -> None:
     assert charge(driver, lease) == 3, "it did not say what it holds: what it held before counts"
 
 
-def test_a_smaller_measurement_never_lowers_what_was_declared() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_smaller_measurement_never_lowers_what_was_declared(driver: CoreDriver) -> None:
     lived(driver, "det", peak=1, steady=1)
     assert charge(driver, driver.consumer("det").acquire(2 * GIB, residue_bytes=450 * MIB)) == 2
 
 
-def test_another_consumer_or_model_learns_for_itself() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_another_consumer_or_model_learns_for_itself(driver: CoreDriver) -> None:
     lived(driver, "det", peak=4, steady=3)
     assert charge(driver, driver.consumer("other").acquire(2 * GIB)) == 2
 
 
-def test_the_holders_own_word_counts_where_the_driver_lists_nobody() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_the_holders_own_word_counts_where_the_driver_lists_nobody(driver: CoreDriver) -> None:
     driver.device.lists_processes = False
     driver.advance(1.5)
     det = driver.consumer("det")
@@ -80,8 +76,7 @@ def test_the_holders_own_word_counts_where_the_driver_lists_nobody() -> None:
         GIB,
     )
     assert "above" in note["reason"]
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert view["drift_bytes"] == GIB
     (why,) = driver.why("det")["leases"]
     assert (why["drifted"], why["footprint"]["held_bytes"]) == (True, 3 * GIB)
@@ -93,8 +88,7 @@ def test_the_holders_own_word_counts_where_the_driver_lists_nobody() -> None:
     assert charge(driver, again) == 3
 
 
-def test_drift_is_said_once_a_lease_and_part() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_drift_is_said_once_a_lease_and_part(driver: CoreDriver) -> None:
     lived(driver, "det", peak=4, steady=3)
     assert [(note["part"], note["measured_bytes"] / GIB) for note in driver.notes("drift")] == [
         ("load_peak", 4),
@@ -103,17 +97,15 @@ def test_drift_is_said_once_a_lease_and_part() -> None:
     assert {note["consumer"] for note in driver.notes("drift")} == {"det"}
 
 
-def test_who_holds_less_than_declared_is_named_when_it_leaves() -> None:
+def test_who_holds_less_than_declared_is_named_when_it_leaves(driver: CoreDriver) -> None:
     """Before, it may still be growing into what it declared."""
-    driver = CoreDriver(8 * GIB)
     det = driver.consumer("det")
     lease = det.acquire(2 * GIB)
     det.hold(1 * GIB)
     det.ready(lease)
     driver.advance(3.0)
     assert driver.notes("drift") == []
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert view["drift_bytes"] == -GIB, "shown all the same"
     det.unload(lease)
     (note,) = driver.notes("drift")
@@ -121,8 +113,7 @@ def test_who_holds_less_than_declared_is_named_when_it_leaves() -> None:
     assert "below" in note["reason"]
 
 
-def test_within_the_tolerance_nobody_drifts() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_within_the_tolerance_nobody_drifts(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     lease = det.acquire(2 * GIB)
     det.load(lease, measured_bytes=2 * GIB + 60 * MIB)
@@ -132,8 +123,7 @@ def test_within_the_tolerance_nobody_drifts() -> None:
     assert "drift_bytes" not in (driver.view(lease) or {})
 
 
-def test_while_somebody_loads_the_gpu_is_read_twenty_times_a_second() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_while_somebody_loads_the_gpu_is_read_twenty_times_a_second(driver: CoreDriver) -> None:
     driver.consumer("det").acquire(2 * GIB)
     driver.advance(0.1)
     before = len(driver.effects)
@@ -143,8 +133,7 @@ def test_while_somebody_loads_the_gpu_is_read_twenty_times_a_second() -> None:
     )
 
 
-def test_a_load_that_is_cut_off_teaches_only_that_it_was_too_much() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_load_that_is_cut_off_teaches_only_that_it_was_too_much(driver: CoreDriver) -> None:
     for peak in (1, 5):
         det = driver.consumer("det")
         lease = det.acquire(2 * GIB)
@@ -158,8 +147,7 @@ def test_a_load_that_is_cut_off_teaches_only_that_it_was_too_much() -> None:
     assert [note["part"] for note in driver.notes("drift")] == ["load_peak"]
 
 
-def test_a_process_with_two_leases_teaches_nothing() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_process_with_two_leases_teaches_nothing(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     first = det.acquire(1 * GIB)
     det.hold(1 * GIB)
@@ -202,18 +190,14 @@ def test_a_refusal_says_that_the_figure_was_learnt() -> None:
 
 def test_why_says_that_a_waiter_needs_more_than_it_declared() -> None:
     driver = CoreDriver(8 * GIB, settings={"footprints": {"w w-model": {"load_peak": [5 * GIB]}}})
-    det = driver.consumer("det")
-    lease = det.acquire(4 * GIB)
-    det.load(lease)
-    det.use_begin(lease)
+    in_use(driver, "det", 4)
     driver.consumer("w").acquire(2 * GIB)
     (why,) = driver.why("w")["leases"]
     assert why["expected_bytes"] == 5 * GIB
     assert why["footprint"]["declared_bytes"]["load_peak"] == 2 * GIB
 
 
-def test_a_lease_that_comes_back_after_a_restart_is_measured_on() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_lease_that_comes_back_after_a_restart_is_measured_on(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     lease = det.acquire(2 * GIB)
     token = det.token(lease)
@@ -228,11 +212,8 @@ def test_a_lease_that_comes_back_after_a_restart_is_measured_on() -> None:
     assert driver.arbiter.footprints()["det det-model"]["steady"] == [3 * GIB]
 
 
-def test_the_residue_of_a_process_that_exits_teaches_nothing() -> None:
-    driver = CoreDriver(8 * GIB)
-    det = driver.consumer("det")
-    lease = det.acquire(2 * GIB)
-    det.load(lease)
+def test_the_residue_of_a_process_that_exits_teaches_nothing(driver: CoreDriver) -> None:
+    det, lease = held(driver, "det", 2)
     driver.advance(1.5)
     det.release(lease, exiting=True)
     det.die()

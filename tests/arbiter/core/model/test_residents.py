@@ -1,7 +1,6 @@
 """The sub-tables of a GPU's residents follow every change; the full invariant check compares them
 with the leases."""
 
-from tests.support import full_check
 from tests.support.core_driver import CoreDriver
 from vram_arbiter.arbiter.core.model.gpu import Residents
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState
@@ -19,14 +18,6 @@ def crowd(count: int) -> tuple[Residents, list[Lease]]:
         holder.load(ids[-1])
     core = driver.arbiter.inspect()
     return core.gpus[GpuId("GPU-0")].residents, [core.leases[lease_id] for lease_id in ids]
-
-
-def test_a_lease_that_goes_is_in_no_table() -> None:
-    residents, (one, two) = crowd(2)
-    residents.remove(two)
-    assert [lease for some in residents.by_state.values() for lease in some.values()] == [one]
-    assert list(residents) == [one.id]
-    assert full_check.residents_disagree(residents) == ""
 
 
 def test_a_reading_sees_what_happened_before_it_began() -> None:

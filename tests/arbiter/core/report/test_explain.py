@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from tests.support.core_driver import CoreDriver
-from tests.support.scenes import held, why
+from tests.support.scenes import held, in_use, shown, why
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.events import Asked
 from vram_arbiter.schemas import defaults as d
@@ -15,10 +15,8 @@ from vram_arbiter.schemas.wire.requests import Acquire
 GIB, MIB = d.GIB, d.MIB
 
 
-def test_status_shows_holders_first_then_the_queue_in_order() -> None:
-    driver = CoreDriver(8 * GIB)
-    busy, lease = held(driver, "busy", 5)
-    busy.use_begin(lease)
+def test_status_shows_holders_first_then_the_queue_in_order(driver: CoreDriver) -> None:
+    busy, lease = in_use(driver, "busy", 5)
     driver.consumer("late").acquire(5 * GIB)
     driver.consumer("urgent").acquire(5 * GIB, priority=90)
     driver.device.names[ProcessKey(9, 9)] = "browser"
@@ -37,9 +35,7 @@ def test_status_shows_holders_first_then_the_queue_in_order() -> None:
         ("browser", True, []),
     ]
     busy.release(lease)
-    shown = driver.view(lease)
-    assert shown is not None
-    assert "ttl_left_s" not in shown
+    assert "ttl_left_s" not in shown(driver, lease)
 
 
 def test_before_the_first_reading_nothing_is_known() -> None:
@@ -53,8 +49,7 @@ def test_why_of_a_stranger_is_empty() -> None:
     assert CoreDriver().why("nobody") == {"consumer": "nobody", "leases": []}
 
 
-def test_why_of_a_resident_lease_says_what_it_is_doing() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_why_of_a_resident_lease_says_what_it_is_doing(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB)
     says = [why(driver, "det")["text"]]
@@ -79,15 +74,13 @@ def test_why_of_a_resident_lease_says_what_it_is_doing() -> None:
     ]
 
 
-def test_why_follows_the_way_of_the_holder() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_why_follows_the_way_of_the_holder(driver: CoreDriver) -> None:
     driver.device.lag_s = 0.5
-    det, lease = held(driver, "det", 5.3, min_residency_s=2.0)
-    det.use_begin(lease)
+    det, lease = in_use(driver, "det", 5.3, min_residency_s=2.0)
     det.use_begin(lease, "u2")
     driver.consumer("vlm").acquire(int(3.3 * GIB))
     first = why(driver, "vlm")
-    assert first["condition"] == "no_room"
+    assert (first["condition"], first["needed_bytes"]) == ("no_room", int(3.3 * GIB))
     assert first["blockers"] == [
         {
             "lease_id": lease,
@@ -127,10 +120,8 @@ def test_why_follows_the_way_of_the_holder() -> None:
 
 def test_why_says_who_is_pinned_idle_or_of_higher_priority() -> None:
     driver = CoreDriver(10 * GIB)
-    busy, busy_lease = held(driver, "busy", 3, priority=90)
-    busy.use_begin(busy_lease)
-    even, even_lease = held(driver, "even", 1)
-    even.use_begin(even_lease)
+    in_use(driver, "busy", 3, priority=90)
+    in_use(driver, "even", 1)
     held(driver, "calm", 1)
     driver.consumer("w").acquire(8 * GIB)
     keeper, keeper_lease = held(driver, "keeper", 1, residue_bytes=450 * MIB, evictable=False)
@@ -156,8 +147,7 @@ def test_why_says_who_is_pinned_idle_or_of_higher_priority() -> None:
     } in blockers
 
 
-def test_why_behind_others_and_behind_a_load() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_why_behind_others_and_behind_a_load(driver: CoreDriver) -> None:
     driver.consumer("det").acquire(5 * GIB)
     driver.consumer("first").acquire(1 * GIB)
     driver.consumer("second").acquire(1 * GIB)
@@ -166,8 +156,7 @@ def test_why_behind_others_and_behind_a_load() -> None:
     assert why(driver, "second")["next"] == "waits behind first as number 2"
 
 
-def test_why_when_only_measurements_are_missing() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_why_when_only_measurements_are_missing(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     det.die()
     driver.consumer("w").acquire(5 * GIB)
@@ -179,8 +168,7 @@ def test_why_when_only_measurements_are_missing() -> None:
     assert lease
 
 
-def test_why_names_relief_of_pressure_and_a_victim_of_somebody_else() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_why_names_relief_of_pressure_and_a_victim_of_somebody_else(driver: CoreDriver) -> None:
     calm, lease = held(driver, "calm", 5)
     driver.device.set(ProcessKey(9, 9), 3 * GIB, driver.now)
     driver.until(lambda: driver.state(lease) == "revoking", limit_s=2.0)
@@ -188,8 +176,7 @@ def test_why_names_relief_of_pressure_and_a_victim_of_somebody_else() -> None:
     assert calm.name == "calm"
 
 
-def test_a_waiter_of_another_plan_sees_the_room_being_made() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_waiter_of_another_plan_sees_the_room_being_made(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     first = driver.consumer("first")
     first.cancel(first.acquire(5 * GIB))
@@ -199,8 +186,7 @@ def test_a_waiter_of_another_plan_sees_the_room_being_made() -> None:
     assert det.name == "det"
 
 
-def test_the_eta_is_learnt_and_honest_about_not_knowing() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_the_eta_is_learnt_and_honest_about_not_knowing(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     vlm = driver.consumer("vlm")
     waiter = vlm.acquire(5 * GIB)
@@ -233,8 +219,7 @@ def test_the_eta_is_learnt_and_honest_about_not_knowing() -> None:
     )
 
 
-def test_a_load_without_eviction_is_a_record_too() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_load_without_eviction_is_a_record_too(driver: CoreDriver) -> None:
     held(driver, "det", 5)
     (record,) = driver.notes("switch")
     assert (record["switched"], record["evicted"], record["verified"]) == (False, [], True)
@@ -246,16 +231,14 @@ def test_a_load_without_eviction_is_a_record_too() -> None:
     )
 
 
-def test_a_lease_may_be_asked_about_by_its_id() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_lease_may_be_asked_about_by_its_id(driver: CoreDriver) -> None:
     _, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
     assert driver.why(waiter)["leases"] == driver.why("vlm")["leases"]
     assert [told["lease_id"] for told in driver.why(lease)["leases"]] == [lease]
 
 
-def test_a_trace_is_carried_from_the_acquire_to_every_note() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_trace_is_carried_from_the_acquire_to_every_note(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     event = Asked(det.client, driver.next_request(), Acquire("n", det.spec(1 * GIB)))
     effects = driver.post(replace(event, traceparent="00-abc-def-01"))
@@ -265,9 +248,8 @@ def test_a_trace_is_carried_from_the_acquire_to_every_note() -> None:
     assert note.about.gpu == GpuId("GPU-0")
 
 
-def test_the_label_of_a_use_is_quoted_safely() -> None:
+def test_the_label_of_a_use_is_quoted_safely(driver: CoreDriver) -> None:
     """Any process may choose it, and a client prints the answer in its error."""
-    driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 5)
     det.use_begin(lease, label="look\x1b[2J")
     driver.consumer("vlm").acquire(5 * GIB)

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import CoreDriver
-from tests.support.scenes import held
+from tests.support.scenes import held, in_use
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ProcessKey
 
@@ -24,8 +24,7 @@ def only(driver: CoreDriver, consumer: str = "w") -> dict[str, Any]:
     return step
 
 
-def test_it_asks_when_the_minimum_residency_ends() -> None:
-    driver = CoreDriver()
+def test_it_asks_when_the_minimum_residency_ends(driver: CoreDriver) -> None:
     _, lease = held(driver, "detector", 6, min_residency_s=2.0)
     driver.consumer("w").acquire(4 * GIB)
     step = only(driver)
@@ -40,10 +39,8 @@ def test_it_asks_when_the_minimum_residency_ends() -> None:
     assert driver.pushes("revoke", lease)
 
 
-def test_it_asks_when_the_waiter_has_aged_enough() -> None:
-    driver = CoreDriver()
-    holder, lease = held(driver, "important", 6, priority=52)
-    holder.use_begin(lease)
+def test_it_asks_when_the_waiter_has_aged_enough(driver: CoreDriver) -> None:
+    _, lease = in_use(driver, "important", 6, priority=52)
     driver.consumer("w").acquire(4 * GIB, priority=50)
     step = only(driver)
     assert step["in_s"] == pytest.approx(2 * d.AGEING_S_PER_POINT, abs=0.1)
@@ -52,8 +49,7 @@ def test_it_asks_when_the_waiter_has_aged_enough() -> None:
     assert driver.pushes("revoke", lease)
 
 
-def test_several_are_asked_together_when_the_last_of_them_may_be() -> None:
-    driver = CoreDriver()
+def test_several_are_asked_together_when_the_last_of_them_may_be(driver: CoreDriver) -> None:
     held(driver, "first", 3.5, min_residency_s=1.0)
     held(driver, "second", 3.5, min_residency_s=3.0)
     driver.consumer("w").acquire(7 * GIB)
@@ -67,8 +63,7 @@ def test_several_are_asked_together_when_the_last_of_them_may_be() -> None:
     assert steps[1]["text"].endswith("when its minimum residency ends")
 
 
-def test_nobody_is_asked_where_nobody_could_make_room() -> None:
-    driver = CoreDriver()
+def test_nobody_is_asked_where_nobody_could_make_room(driver: CoreDriver) -> None:
     driver.device.names[ProcessKey(9, 9)] = "game"
     driver.device.set(ProcessKey(9, 9), 5 * GIB, driver.now)
     driver.advance(1.5)
@@ -86,9 +81,8 @@ def test_nobody_is_asked_where_nobody_could_make_room() -> None:
     )
 
 
-def test_whoever_may_be_asked_already_waits_for_a_measurement_first() -> None:
+def test_whoever_may_be_asked_already_waits_for_a_measurement_first(driver: CoreDriver) -> None:
     """A dead process's residue may come back any moment: nobody is asked meanwhile."""
-    driver = CoreDriver()
     gone, lease = held(driver, "gone", 1, residue_bytes=1 * GIB)
     gone.unload(lease)
     driver.advance(1.0)
@@ -101,10 +95,8 @@ def test_whoever_may_be_asked_already_waits_for_a_measurement_first() -> None:
     assert step["text"] == "revokes holder in 0.0 s, with the next reading of the GPU"
 
 
-def test_a_holder_on_its_way_out() -> None:
-    driver = CoreDriver()
-    holder, lease = held(driver, "holder", 6)
-    holder.use_begin(lease)
+def test_a_holder_on_its_way_out(driver: CoreDriver) -> None:
+    holder, lease = in_use(driver, "holder", 6)
     driver.consumer("w").acquire(4 * GIB)
     step = only(driver)
     assert step["action"] == "deadline"
@@ -127,8 +119,7 @@ def test_a_holder_on_its_way_out() -> None:
     assert "until its bytes are measured gone" in only(driver)["text"]
 
 
-def test_a_load_under_way() -> None:
-    driver = CoreDriver()
+def test_a_load_under_way(driver: CoreDriver) -> None:
     driver.consumer("loader").acquire(3 * GIB)
     driver.advance(0.01)
     driver.consumer("w").acquire(3 * GIB)
@@ -145,8 +136,7 @@ def test_a_load_under_way() -> None:
     assert only(known)["in_s"] == pytest.approx(3.5, abs=0.1)
 
 
-def test_a_gpu_that_cannot_be_read_and_one_that_shows_no_room() -> None:
-    driver = CoreDriver()
+def test_a_gpu_that_cannot_be_read_and_one_that_shows_no_room(driver: CoreDriver) -> None:
     driver.device.failing = "hangs"
     driver.advance(1.5)
     driver.consumer("w").acquire(3 * GIB)
@@ -164,8 +154,7 @@ def test_a_gpu_that_cannot_be_read_and_one_that_shows_no_room() -> None:
     assert only(silent)["text"].endswith("the ledger has room, but the GPU has to show it")
 
 
-def test_pressure_plans_nothing_of_its_own() -> None:
-    driver = CoreDriver()
+def test_pressure_plans_nothing_of_its_own(driver: CoreDriver) -> None:
     holder, _ = held(driver, "holder", 4, evictable=False)
     holder.hold(int(7.9 * GIB))
     driver.advance(1.5)
@@ -173,8 +162,7 @@ def test_pressure_plans_nothing_of_its_own() -> None:
     assert plan(driver) == []
 
 
-def test_after_a_restart_the_latest_holder_gives_the_bound() -> None:
-    driver = CoreDriver()
+def test_after_a_restart_the_latest_holder_gives_the_bound(driver: CoreDriver) -> None:
     held(driver, "holder", 4, ttl_s=10.0)
     driver.restart()
     driver.consumer("w").acquire(3 * GIB)
@@ -183,10 +171,8 @@ def test_after_a_restart_the_latest_holder_gives_the_bound() -> None:
     assert step["in_s"] == pytest.approx(10.0 + d.FENCE_GRACE_S, abs=0.1)
 
 
-def test_behind_others_only_its_own_end_is_planned() -> None:
-    driver = CoreDriver()
-    holder, lease = held(driver, "holder", 6)
-    holder.use_begin(lease)
+def test_behind_others_only_its_own_end_is_planned(driver: CoreDriver) -> None:
+    in_use(driver, "holder", 6)
     driver.consumer("head").acquire(4 * GIB)
     driver.consumer("w").acquire(5 * GIB, wait_timeout_s=12.0)
     step = only(driver)
@@ -209,8 +195,7 @@ def test_the_estimate_counts_those_who_will_be_asked() -> None:
     assert (entry["eta_s"], entry["eta_source"]) == (None, "none")
 
 
-def test_a_resident_lease_has_no_plan() -> None:
-    driver = CoreDriver()
+def test_a_resident_lease_has_no_plan(driver: CoreDriver) -> None:
     held(driver, "w", 3)
     assert plan(driver) == []
 
@@ -228,8 +213,7 @@ def test_the_estimate_behind_others_counts_their_loads() -> None:
     fits once those ahead of it have left was too."""
     learnt = {"detector": {"drain_s": 1.0, "unload_s": 0.5, "verify_s": 0.5}, **LOADS}
     driver = CoreDriver(8 * GIB, settings={"learnt": learnt})
-    detector, lease = held(driver, "detector", 7)
-    detector.use_begin(lease)
+    _, lease = in_use(driver, "detector", 7)
     driver.consumer("head").acquire(4 * GIB)
     driver.consumer("second").acquire(2 * GIB)
     driver.consumer("third").acquire(3 * GIB)

@@ -82,8 +82,7 @@ def test_a_page_goes_on_where_the_last_one_ended_though_that_lease_is_gone() -> 
     assert "next" not in rest
 
 
-def test_why_explains_the_oldest_leases_of_a_consumer_with_many() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_why_explains_the_oldest_leases_of_a_consumer_with_many(driver: CoreDriver) -> None:
     driver.consumer("holder").acquire(7 * GIB)
     crowd = driver.consumer("crowd")
     leases = [crowd.acquire(5 * GIB) for _ in range(EXPLAINED_MAX + 3)]
@@ -95,8 +94,7 @@ def test_why_explains_the_oldest_leases_of_a_consumer_with_many() -> None:
     assert "more" not in alone
 
 
-def test_of_many_blockers_the_largest_are_told() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_of_many_blockers_the_largest_are_told(driver: CoreDriver) -> None:
     for number in range(BLOCKERS_MAX + 5):
         person = driver.consumer(f"small{number}")
         person.load(person.acquire((1 + number) * d.MIB))
@@ -128,9 +126,8 @@ def test_waits_that_end_together_are_denied_in_slices() -> None:
     assert len(driver.notes("denied")) == len(leases)
 
 
-def test_details_say_what_why_says() -> None:
+def test_details_say_what_why_says(driver: CoreDriver) -> None:
     """The words and the estimate of a waiter come from the arbiter, in one request for all."""
-    driver = CoreDriver(8 * GIB)
     held(driver, "detector", 5)
     first, second = driver.consumer("grab"), driver.consumer("vlm")
     first.acquire(6 * GIB)

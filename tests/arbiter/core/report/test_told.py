@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import START_S, CoreDriver, answer, as_wire, refusal
-from tests.support.scenes import held, order, sent_away
+from tests.support.scenes import give_back, held, in_use, order, sent_away, shown
 from vram_arbiter.arbiter.core.events import ProbeFailed
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.schemas import defaults as d
@@ -28,11 +28,9 @@ def only(found: list[Any]) -> Any:
 
 # -- views
 @pytest.mark.parametrize(("exclusive", "mode"), [(True, "exclusive"), (False, "shared")])
-def test_a_lease_as_it_is_shown(exclusive: bool, mode: str) -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_lease_as_it_is_shown(driver: CoreDriver, exclusive: bool, mode: str) -> None:
     person, lease = held(driver, "det", 2, exclusive=exclusive)
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert {
         key: view[key] for key in ("mode", "consumer", "model", "priority", "evictable", "uses")
     } == {
@@ -46,8 +44,7 @@ def test_a_lease_as_it_is_shown(exclusive: bool, mode: str) -> None:
     assert (view["charge_bytes"], view["pid"]) == (2 * GIB, person.process.pid)
 
 
-def test_a_gpu_as_it_is_shown() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_gpu_as_it_is_shown(driver: CoreDriver) -> None:
     held(driver, "det", 2)
     shown = driver.gpu()
     shown.pop("sample_age_s")
@@ -72,8 +69,7 @@ def test_a_gpu_as_it_is_shown() -> None:
     )
 
 
-def test_why_of_a_resident_lease_asks_for_nothing() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_why_of_a_resident_lease_asks_for_nothing(driver: CoreDriver) -> None:
     _, lease = held(driver, "det", 2)
     told = only(driver.why("det")["leases"])
     told.pop("footprint")
@@ -96,22 +92,8 @@ def test_why_of_a_resident_lease_asks_for_nothing() -> None:
     }
 
 
-def test_an_estimate_says_that_it_was_learnt() -> None:
-    driver = CoreDriver(
-        8 * GIB, settings={"learnt": {"loader": {"load_s": 1.0}, "vlm": {"load_s": 2.0}}}
-    )
-    loader = driver.consumer("loader")
-    loader.acquire(2 * GIB)
-    vlm = driver.consumer("vlm")
-    waiting = vlm.acquire(2 * GIB)  # fits; only the other one's load is in the way
-    assert driver.state(waiting) == "queued"
-    told = only(driver.why("vlm")["leases"])
-    assert (told["eta_s"], told["eta_source"]) == (3.0, "learnt"), "after the other's"
-
-
 # -- answers
-def test_an_acquire_said_again_after_the_load_is_answered_as_granted() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_an_acquire_said_again_after_the_load_is_answered_as_granted(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     lease = det.acquire(2 * GIB, nonce="n")
     det.load(lease)
@@ -119,18 +101,7 @@ def test_an_acquire_said_again_after_the_load_is_answered_as_granted() -> None:
     assert (again["state"], again["lease"]["state"]) == ("loading", "held")
 
 
-def test_what_never_fits_says_the_way_out() -> None:
-    driver = CoreDriver(8 * GIB)
-    refused = refusal(driver.consumer("big").try_acquire(8 * GIB))
-    assert (refused.code, refused.hint) == (
-        "vram_insufficient",
-        "use a smaller model or a lower precision",
-    )
-    assert refused.message == "big needs 8 GiB; the GPU has 8 GiB less a reserve of 300 MiB"
-
-
-def test_refusals_of_operators_say_why() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_refusals_of_operators_say_why(driver: CoreDriver) -> None:
     _, lease = held(driver, "det", 5)
     waiting = driver.consumer("vlm").acquire(5 * GIB)
     ops = driver.consumer("ops")
@@ -147,8 +118,7 @@ def test_refusals_of_operators_say_why() -> None:
 
 
 # -- the history
-def test_a_load_is_noted_with_what_it_took() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_load_is_noted_with_what_it_took(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     lease = det.acquire(3 * GIB, 2 * GIB)
     driver.advance(0.5)
@@ -163,8 +133,7 @@ def test_a_load_is_noted_with_what_it_took() -> None:
     assert note["load_ms"] == pytest.approx(500)
 
 
-def test_a_switch_is_noted_with_what_each_victim_held() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_switch_is_noted_with_what_each_victim_held(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     vlm = driver.consumer("vlm")
     wanted = vlm.acquire(5 * GIB)
@@ -181,20 +150,7 @@ def test_a_switch_is_noted_with_what_each_victim_held() -> None:
     }
 
 
-def test_a_denial_is_noted_with_its_reason() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
-    vlm = driver.consumer("vlm")
-    wanted = vlm.acquire(5 * GIB, wait_timeout_s=1.0)
-    driver.advance(1.1)
-    (push,) = driver.pushes("denied", wanted)
-    note = only(driver.notes("denied"))
-    assert (note["code"], note["reason"]) == ("wait_timeout", push["error"]["message"])
-
-
-def test_pressure_and_outages_are_noted_with_their_gpu() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_pressure_and_outages_are_noted_with_their_gpu(driver: CoreDriver) -> None:
     held(driver, "det", 5)
     driver.device.set(ProcessKey(9, 9), 3 * GIB, driver.now)
     driver.advance(2.0)
@@ -203,14 +159,6 @@ def test_pressure_and_outages_are_noted_with_their_gpu() -> None:
     driver.advance(2.0)
     note = only(driver.notes("probe_failed"))
     assert (note["gpu"], note["reason"]) == ("GPU-0", "the driver is gone")
-
-
-def test_orders_are_noted_by_their_name() -> None:
-    driver = CoreDriver(8 * GIB)
-    ops = driver.consumer("ops")
-    for action in ("drain", "resume"):
-        ops.order(action)
-    assert [note["action"] for note in driver.notes("operator")] == ["drain", "resume"]
 
 
 def test_who_is_parked_is_noted_with_its_host_ram() -> None:
@@ -273,8 +221,7 @@ def test_a_record_of_who_is_away_says_how_it_comes_back() -> None:
     assert (record["left_for"], record["gpu"], record["charge_bytes"]) == ("policy", None, 0)
 
 
-def test_a_debt_keeps_the_context_of_a_living_process_over_a_restart() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_debt_keeps_the_context_of_a_living_process_over_a_restart(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 3, residue_bytes=450 * MIB, ttl_s=5.0)
     driver.advance(6.0)  # it expired; its process lives
     assert driver.state(lease) == "over"
@@ -291,8 +238,7 @@ def test_a_debt_keeps_the_context_of_a_living_process_over_a_restart() -> None:
     assert driver.gpu()["charged_bytes"] == 450 * MIB
 
 
-def test_an_adopted_lease_says_where_it_comes_from() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_an_adopted_lease_says_where_it_comes_from(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 3)
     token = det.token(lease)
     driver.restart(keep_journal=False)
@@ -302,32 +248,18 @@ def test_an_adopted_lease_says_where_it_comes_from() -> None:
 
 
 # -- waiting beside what nobody owns
-def test_a_small_one_may_pass_where_nobody_has_an_account() -> None:
-    driver = CoreDriver(8 * GIB)
-    driver.device.lists_processes = False
-    driver.device.set(ProcessKey(9, 9), 4 * GIB, driver.now)
-    driver.advance(2.0)
-    large = driver.consumer("large").acquire(6 * GIB)
-    small = driver.consumer("small").acquire(1 * GIB)
-    assert driver.state(large) == "queued"
-    driver.advance(1.0)
-    assert driver.state(small) in ("queued", "loading")
 
 
-def test_the_head_says_what_keeps_the_engine_from_asking() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5)
-    det.use_begin(lease)
+def test_the_head_says_what_keeps_the_engine_from_asking(driver: CoreDriver) -> None:
+    in_use(driver, "det", 5)
     waiting = driver.consumer("vlm").acquire(5 * GIB, priority=d.PRIORITY - 10)
     assert core_lease(driver, waiting).request.reason == Wait.NO_VICTIM
 
 
-def test_nobody_is_asked_while_a_dead_process_may_still_make_room() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_nobody_is_asked_while_a_dead_process_may_still_make_room(driver: CoreDriver) -> None:
     driver.device.lag_s = 0.5
     gone, left = held(driver, "gone", 3, residue_bytes=450 * MIB)
-    gone.unload(left)
-    driver.until(lambda: driver.state(left) == "over")
+    give_back(driver, gone, left)
     _, lease = held(driver, "det", 5)
     gone.die()
     waiting = driver.consumer("vlm").acquire(3 * GIB)
@@ -335,8 +267,7 @@ def test_nobody_is_asked_while_a_dead_process_may_still_make_room() -> None:
     assert driver.state(lease) == "held"
 
 
-def test_an_answer_to_revoke_is_noted_with_its_lease() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_an_answer_to_revoke_is_noted_with_its_lease(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     driver.consumer("vlm").acquire(5 * GIB)
     driver.until(lambda: driver.state(lease) == "revoking")
@@ -345,27 +276,7 @@ def test_an_answer_to_revoke_is_noted_with_its_lease() -> None:
     assert (note["lease_id"], note["safe_point_eta_s"], note["uses"]) == (lease, 0.5, 0)
 
 
-def test_what_is_not_kept_after_a_restart_is_told_by_its_name_and_why() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 3)
-    token = det.token(lease)
-    driver.restart()
-    thief = driver.consumer("thief")
-    (told,) = answer(thief.reattach(lease, token, spec=det.specs[lease]))["leases"]
-    assert (told["lease_id"], told["kept"]) == (lease, False)
-    assert (told["error"]["code"], told["error"]["hint"]) == ("not_permitted", "ask as its holder")
-
-
-def test_a_use_of_a_lease_that_was_asked_to_leave_is_told_to_wait() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5)
-    driver.consumer("vlm").acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
-    assert refusal(det.use_begin(lease)).hint == "wait until it is granted again"
-
-
-def test_a_gpu_is_stale_when_its_newest_reading_may_gate_no_grant() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_gpu_is_stale_when_its_newest_reading_may_gate_no_grant(driver: CoreDriver) -> None:
     arbiter, age_s = driver.arbiter, driver.settings.sample_max_age_s
     driver.consumer("det")
     assert arbiter.stale(driver.now) == []
@@ -375,20 +286,13 @@ def test_a_gpu_is_stale_when_its_newest_reading_may_gate_no_grant() -> None:
     assert arbiter.stale(driver.now + age_s + 0.1) == [], "a failed reading is news as well"
 
 
-def test_the_time_since_the_grant_outlives_a_restart() -> None:
+def test_the_time_since_the_grant_outlives_a_restart(driver: CoreDriver) -> None:
     """`vramctl status` counted from the restart: a lease that was held for hours looked new."""
-    driver = CoreDriver(8 * GIB)
     det, lease = held(driver, "det", 2)
     driver.advance(1.0)
     det.renew((lease, det.token(lease)))
-    before = view_of(driver, lease)["granted_s"]
+    before = shown(driver, lease)["granted_s"]
     assert before == pytest.approx(1.0, abs=0.1)
     driver.restart()
-    assert view_of(driver, lease)["granted_s"] >= before
-    assert view_of(driver, lease)["since_s"] < 0.1, "it is in its present state since the restart"
-
-
-def view_of(driver: CoreDriver, lease: LeaseId) -> dict[str, Any]:
-    found = driver.view(lease)
-    assert found is not None
-    return found
+    assert shown(driver, lease)["granted_s"] >= before
+    assert shown(driver, lease)["since_s"] < 0.1, "it is in its present state since the restart"

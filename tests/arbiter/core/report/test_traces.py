@@ -9,8 +9,7 @@ HERS = f"00-{'a' * 32}-{'1' * 16}-01"
 HIS = f"00-{'b' * 32}-{'2' * 16}-01"
 
 
-def test_a_holder_is_asked_in_the_name_of_whoever_waits() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_holder_is_asked_in_the_name_of_whoever_waits(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     assert "traceparent" not in driver.notes("granted")[-1]
     vlm = driver.consumer("vlm")
@@ -22,15 +21,13 @@ def test_a_holder_is_asked_in_the_name_of_whoever_waits() -> None:
     assert driver.state(lease) == "revoking"
 
 
-def test_a_waiter_without_a_trace_names_none() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_waiter_without_a_trace_names_none(driver: CoreDriver) -> None:
     held(driver, "det", 5)
     driver.consumer("vlm").acquire(5 * GIB)
     assert "traceparent" not in driver.pushes("revoke")[0]
 
 
-def test_a_lease_that_is_called_back_belongs_to_the_caller() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_lease_that_is_called_back_belongs_to_the_caller(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver)
     det.traceparent = HERS
     det.reacquire(lease)
@@ -40,8 +37,7 @@ def test_a_lease_that_is_called_back_belongs_to_the_caller() -> None:
     assert policy.traceparent is None
 
 
-def test_one_that_is_called_back_while_it_is_measured_too() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_one_that_is_called_back_while_it_is_measured_too(driver: CoreDriver) -> None:
     driver.device.lag_s = 1.0
     det, lease = held(driver, "det", 5, standby=True)
     det.traceparent = HIS
@@ -54,12 +50,3 @@ def test_one_that_is_called_back_while_it_is_measured_too() -> None:
     policy.load(wanted)
     driver.until(lambda: bool(driver.pushes("revoke", wanted)))
     assert driver.pushes("revoke", wanted)[0]["traceparent"] == HIS
-
-
-def test_a_grant_says_whether_it_was_asked_for() -> None:
-    driver = CoreDriver(8 * GIB)
-    _, lease, policy, wanted = sent_away(driver)
-    assert not any("by_itself" in note for note in driver.notes("granted"))
-    policy.unload(wanted)
-    driver.until(lambda: driver.state(lease) == "loading")
-    assert driver.notes("granted")[-1]["by_itself"] is True

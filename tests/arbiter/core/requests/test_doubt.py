@@ -81,9 +81,8 @@ def test_a_holder_with_a_token_of_this_start_is_not_believed() -> None:
     assert kept["error"]["code"] in ("stale_token", "not_permitted"), "nor another process"
 
 
-def test_a_lease_that_was_away_is_what_its_holder_says() -> None:
+def test_a_lease_that_was_away_is_what_its_holder_says(driver: CoreDriver) -> None:
     """Its record says that it holds nothing; the record of its return may be lost."""
-    driver = CoreDriver(8 * GIB)
     det, lease, policy, wanted = sent_away(driver)
     old, spec = det.token(lease), det.specs[lease]
     policy_token = policy.token(wanted)

@@ -6,10 +6,11 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.scenes import give_back, held, in_use, shown
 from vram_arbiter.arbiter.core.effects import Effect, Note, Signal
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+from vram_arbiter.schemas.ids import ProcessKey
 
 GIB, MIB = d.GIB, d.MIB
 BY = "ops (uid 0, pid 7)"
@@ -24,14 +25,6 @@ def order_of(ops: Consumer, action: Any, target: str = "", reason: str = "test")
     return ops.order(action, target, reason, BY)
 
 
-def held_bytes(driver: CoreDriver, name: str, count: int, **spec: Any) -> tuple[Consumer, LeaseId]:
-    consumer = driver.consumer(name)
-    lease = consumer.acquire(count, **spec)
-    driver.until(lambda: driver.state(lease) == "loading")
-    consumer.load(lease)
-    return consumer, lease
-
-
 def noted(effects: list[Effect]) -> dict[str, Any]:
     (note,) = [e for e in effects if isinstance(e, Note) and e.kind == "operator"]
     return words.event(note)
@@ -39,8 +32,7 @@ def noted(effects: list[Effect]) -> dict[str, Any]:
 
 # -- evict
 def test_an_evicted_holder_in_use_finishes_first(driver: CoreDriver, ops: Consumer) -> None:
-    det, lease = held_bytes(driver, "det", 5 * GIB)
-    det.use_begin(lease)
+    det, lease = in_use(driver, "det", 5)
     effects = order_of(ops, "evict", "det", "maintenance")
     assert answer(effects)["state"] == "revoking"
     assert noted(effects) | {
@@ -58,8 +50,7 @@ def test_an_evicted_holder_in_use_finishes_first(driver: CoreDriver, ops: Consum
     early = refusal(other.use_begin(lease, token=token))
     assert (early.code, early.details["revoked"]) == ("lease_revoking", order)
     det.use_end(lease)
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, det, lease)
     late = refusal(other.use_begin(lease, token=token))
     assert (late.code, late.details["state"], late.details["revoked"]) == (
         "bad_state",
@@ -70,7 +61,7 @@ def test_an_evicted_holder_in_use_finishes_first(driver: CoreDriver, ops: Consum
 
 
 def test_evicting_twice_asks_once(driver: CoreDriver, ops: Consumer) -> None:
-    _, lease = held_bytes(driver, "det", 5 * GIB)
+    _, lease = held(driver, "det", 5)
     order_of(ops, "evict", lease)
     effects = order_of(ops, "evict", lease)
     assert noted(effects)["repeated"] is True
@@ -82,8 +73,7 @@ def test_a_holder_that_leaves_for_a_waiter_hears_of_the_operator(
 ) -> None:
     """`vramctl run` lets a waiter of its own priority wait, and ends its program for an
     operator."""
-    det, lease = held_bytes(driver, "det", 5 * GIB)
-    det.use_begin(lease)
+    det, lease = in_use(driver, "det", 5)
     driver.consumer("vlm").acquire(5 * GIB)
     driver.until(lambda: bool(driver.pushes("revoke", lease)))
     det.ack(lease, None)
@@ -100,8 +90,7 @@ def test_a_holder_that_leaves_for_a_waiter_hears_of_the_operator(
 
 def test_the_push_of_a_repeated_evict_puts_off_no_other(driver: CoreDriver, ops: Consumer) -> None:
     """An operator who repeats an evict all the time would keep the ladder from its own pushes."""
-    det, lease = held_bytes(driver, "det", 5 * GIB)
-    det.use_begin(lease)
+    _, lease = in_use(driver, "det", 5)
     order_of(ops, "evict", lease)
     driver.advance(0.2)
     order_of(ops, "evict", lease)
@@ -114,7 +103,7 @@ def test_the_push_of_a_repeated_evict_puts_off_no_other(driver: CoreDriver, ops:
 def test_a_pinned_holder_is_not_evicted_even_by_an_operator(
     driver: CoreDriver, ops: Consumer, spec: dict[str, Any]
 ) -> None:
-    _, lease = held_bytes(driver, "det", 5 * GIB, **spec)
+    _, lease = held(driver, "det", 5, **spec)
     if not spec:
         order_of(ops, "pin", lease)
     assert refusal(order_of(ops, "evict", lease)).code == "bad_state"
@@ -131,7 +120,7 @@ def test_only_what_is_resident_can_be_evicted(driver: CoreDriver, ops: Consumer)
 def test_a_consumer_with_several_leases_has_to_be_named_by_lease(
     driver: CoreDriver, ops: Consumer
 ) -> None:
-    det, first = held_bytes(driver, "det", 1 * GIB)
+    det, first = held(driver, "det", 1)
     second = det.acquire(1 * GIB)
     refused = refusal(order_of(ops, "evict", "det"))
     assert (refused.code, refused.details["leases"]) == ("bad_request", [first, second])
@@ -140,13 +129,13 @@ def test_a_consumer_with_several_leases_has_to_be_named_by_lease(
 def test_of_a_resident_and_a_waiting_lease_the_resident_is_meant(
     driver: CoreDriver, ops: Consumer
 ) -> None:
-    det, first = held_bytes(driver, "det", 5 * GIB, min_residency_s=100.0)
+    det, first = held(driver, "det", 5, min_residency_s=100.0)
     det.acquire(5 * GIB)
     assert answer(order_of(ops, "pin", "det"))["lease"]["lease_id"] == first
 
 
 def test_nobody_and_the_dead_are_told_apart(driver: CoreDriver, ops: Consumer) -> None:
-    det, lease = held_bytes(driver, "det", 5 * GIB)
+    det, lease = held(driver, "det", 5)
     det.die()
     assert refusal(order_of(ops, "evict", "nobody")).code == "unknown_lease"
     over = refusal(order_of(ops, "evict", lease))
@@ -155,7 +144,7 @@ def test_nobody_and_the_dead_are_told_apart(driver: CoreDriver, ops: Consumer) -
 
 @pytest.mark.parametrize("evictable", [True, False])
 def test_every_refusal_says_what_to_do(driver: CoreDriver, ops: Consumer, evictable: bool) -> None:
-    _, lease = held_bytes(driver, "det", 5 * GIB, evictable=evictable)
+    _, lease = held(driver, "det", 5, evictable=evictable)
     waiter = driver.consumer("w").acquire(5 * GIB) if evictable else lease
     alive = refusal(order_of(ops, "release_dead", lease))
     assert "heard from 0.0 s ago" in alive.message, "it said -0.0 where the lease was just renewed"
@@ -174,7 +163,7 @@ def test_every_refusal_says_what_to_do(driver: CoreDriver, ops: Consumer, evicta
 
 # -- pins
 def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consumer) -> None:
-    _, lease = held_bytes(driver, "det", 5 * GIB)
+    _, lease = held(driver, "det", 5)
     vlm = driver.consumer("vlm")
     waiting = vlm.acquire(3 * GIB)
     assert driver.state(lease) == "revoking"
@@ -183,7 +172,7 @@ def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consum
 
     other = CoreDriver(8 * GIB)
     operator = other.consumer("ops")
-    _, lease = held_bytes(other, "det", 5 * GIB, min_residency_s=1.0)
+    _, lease = held(other, "det", 5, min_residency_s=1.0)
     policy = other.consumer("policy")
     waiting = policy.acquire(4 * GIB)
     order_of(operator, "pin", lease, "demo for the press")
@@ -193,53 +182,38 @@ def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consum
     why = other.why("policy")["leases"][0]
     blocker = why["blockers"][0]
     assert (blocker["condition"], blocker["by"]) == ("pinned", f"{BY}: demo for the press")
-    view = other.view(lease)
-    assert view is not None
+    view = shown(other, lease)
     assert (view["evictable"], view["pinned"]) == (False, f"{BY}: demo for the press")
     order_of(operator, "unpin", lease, "")
     assert other.state(lease) == "revoking"
     assert other.notes("operator")[-1]["action"] == "unpin"
 
 
-def test_a_request_that_a_pin_is_in_the_way_of_waits_for_the_unpin(
-    driver: CoreDriver, ops: Consumer
-) -> None:
-    _, lease = held_bytes(driver, "det", 5 * GIB)
-    order_of(ops, "pin", lease)
-    waiter = driver.consumer("policy").acquire(4 * GIB)
-    driver.advance(10.0)
-    assert (driver.state(waiter), driver.state(lease)) == ("queued", "held")
-    order_of(ops, "unpin", lease, "")
-    assert driver.state(lease) == "revoking"
-
-
 def test_a_waiter_can_be_pinned_for_when_it_holds(driver: CoreDriver, ops: Consumer) -> None:
-    det, _ = held_bytes(driver, "det", 5 * GIB, min_residency_s=100.0)
+    det, _ = held(driver, "det", 5, min_residency_s=100.0)
     waiting = driver.consumer("policy").acquire(4 * GIB)
     order_of(ops, "pin", waiting)
-    view = driver.view(waiting)
-    assert view is not None
+    view = shown(driver, waiting)
     assert view["pinned"].startswith(BY)
     del det
 
 
 def test_only_an_operators_pin_is_undone(driver: CoreDriver, ops: Consumer) -> None:
-    _, mine = held_bytes(driver, "det", 1 * GIB, evictable=False)
-    _, free = held_bytes(driver, "vlm", 1 * GIB)
+    _, mine = held(driver, "det", 1, evictable=False)
+    _, free = held(driver, "vlm", 1)
     for lease, evictable in ((mine, False), (free, True)):
         details = refusal(order_of(ops, "unpin", lease)).details
         assert (details["problem"], details.get("evictable", True)) == ("not_pinned", evictable)
 
 
 def test_a_pin_outlives_the_daemon(driver: CoreDriver, ops: Consumer) -> None:
-    det, lease = held_bytes(driver, "det", 5 * GIB)
+    det, lease = held(driver, "det", 5)
     order_of(ops, "pin", lease, "why not")
     token = det.token(lease)
     driver.restart()
     det.connect()
     det.reattach(lease, token)
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert view["pinned"] == f"{BY}: why not"
 
 
@@ -247,7 +221,7 @@ def test_a_pin_outlives_the_daemon(driver: CoreDriver, ops: Consumer) -> None:
 def test_a_drained_arbiter_grants_nothing_and_keeps_what_is_held(
     driver: CoreDriver, ops: Consumer
 ) -> None:
-    _, lease = held_bytes(driver, "det", 3 * GIB)
+    _, lease = held(driver, "det", 3)
     assert answer(order_of(ops, "drain", reason="new driver"))["drained"] == f"{BY}: new driver"
     waiting = driver.consumer("vlm").acquire(1 * GIB)
     driver.advance(20.0)
@@ -262,7 +236,7 @@ def test_a_drained_arbiter_grants_nothing_and_keeps_what_is_held(
 @pytest.mark.parametrize("with_lease", [True, False])
 def test_a_drain_outlives_the_daemon(driver: CoreDriver, ops: Consumer, with_lease: bool) -> None:
     if with_lease:
-        det, lease = held_bytes(driver, "det", 3 * GIB)
+        det, lease = held(driver, "det", 3)
         token = det.token(lease)
     order_of(ops, "drain", reason="new driver")
     driver.restart()
@@ -283,11 +257,12 @@ def test_a_drain_outlives_the_daemon(driver: CoreDriver, ops: Consumer, with_lea
 def test_the_lease_of_a_silent_holder_is_given_up_and_its_bytes_measured(
     driver: CoreDriver, ops: Consumer
 ) -> None:
-    det, lease = held_bytes(driver, "det", 5 * GIB, ttl_s=600.0)
+    det, lease = held(driver, "det", 5, ttl_s=600.0)
     refused = refusal(order_of(ops, "release_dead", lease))
     assert "not dead" in refused.message
     driver.advance(450.0)
     assert answer(order_of(ops, "release_dead", lease, "hangs since noon"))["state"] == "expired"
+    assert driver.notes("operator")[-1]["action"] == "release_dead"
     (lost,) = driver.pushes("lost", lease)
     assert lost["error"]["code"] == "lease_expired"
     assert lost["error"]["details"]["order"] == {"by": BY, "reason": "hangs since noon"}
@@ -299,16 +274,9 @@ def test_the_lease_of_a_silent_holder_is_given_up_and_its_bytes_measured(
 
 
 def test_a_lease_in_use_is_never_given_up(driver: CoreDriver, ops: Consumer) -> None:
-    det, lease = held_bytes(driver, "det", 5 * GIB, ttl_s=600.0)
-    det.use_begin(lease)
+    _, lease = in_use(driver, "det", 5, ttl_s=600.0)
     driver.advance(450.0)
     assert "in use" in refusal(order_of(ops, "release_dead", lease)).message
-
-
-def test_a_waiter_has_nothing_to_be_given_up(driver: CoreDriver, ops: Consumer) -> None:
-    held_bytes(driver, "det", 5 * GIB, min_residency_s=100.0)
-    waiting = driver.consumer("policy").acquire(4 * GIB)
-    assert refusal(order_of(ops, "release_dead", waiting)).code == "bad_state"
 
 
 def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
@@ -316,7 +284,7 @@ def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
 ) -> None:
     """Regression: recovery ended with the verdict on a declared-dead holder and not with its lease,
     so all requests waited."""
-    det, lease = held_bytes(driver, "det", 5 * GIB, ttl_s=600.0)
+    det, lease = held(driver, "det", 5, ttl_s=600.0)
     driver.restart()
     ops.connect()
     order_of(ops, "release_dead", lease, "it was a crash")
@@ -329,13 +297,13 @@ def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
 
 @pytest.mark.parametrize("restarts", [1, 2])
 def test_who_is_given_up_and_keeps_its_bytes_has_its_lease_until_it_fences_itself(
+    driver: CoreDriver,
     restarts: int,
 ) -> None:
     """A frozen process wakes up and goes on for as long as it believes in its lease; what it keeps
     until then is no mere residue."""
-    driver = CoreDriver(8 * GIB)
     ops = driver.consumer("ops")
-    det, lease = held_bytes(driver, "det", 5 * GIB, ttl_s=30.0)
+    det, lease = held(driver, "det", 5, ttl_s=30.0)
     driver.restart()
     ops.connect()
     order_of(ops, "release_dead", lease, "frozen")
@@ -365,7 +333,7 @@ def test_who_is_given_up_and_is_too_small_to_be_seen_has_its_lease_until_it_fenc
     while all of them are there. So it is where a lease of 2 GiB put no more than that on the GPU:
     what counts is what a reading could see leave, not what is charged."""
     driver.device.lists_processes = lists
-    det, lease = held_bytes(driver, "det", charged, residue_bytes=450 * MIB, ttl_s=10.0)
+    det, lease = held(driver, "det", charged / GIB, residue_bytes=450 * MIB, ttl_s=10.0)
     det.hold(500 * MIB)
     driver.restart()
     ops.connect()
@@ -394,7 +362,7 @@ def test_who_is_given_up_while_it_loads_may_load_on_until_it_fences_itself(
 def test_the_history_names_the_operator_that_evicts(driver: CoreDriver, ops: Consumer) -> None:
     """Regression: the event `revoke_asked` of an operator's order had the reason " needs the
     room"."""
-    _, lease = held_bytes(driver, "det", 5 * GIB)
+    _, lease = held(driver, "det", 5)
     order_of(ops, "evict", lease, "service")
     (note,) = driver.notes("revoke_asked")
     assert note["reason"] == f"evicted by {BY}: service"
@@ -410,8 +378,7 @@ def test_a_stuck_holder_is_told_to_end_and_killed_when_asked_twice(
     driver: CoreDriver, ops: Consumer
 ) -> None:
     """Its own use may be what is stuck: it protects it from an eviction, not from a person."""
-    det, lease = held_bytes(driver, "det", 5 * GIB)
-    det.use_begin(lease)
+    det, lease = in_use(driver, "det", 5)
     for signal in ("term", "kill", "kill"):
         effects = order_of(ops, "kill", "det", "it hangs")
         assert signals(effects) == [(det.process, signal)]
@@ -421,7 +388,7 @@ def test_a_stuck_holder_is_told_to_end_and_killed_when_asked_twice(
     assert (told["by"], told["reason"]) == (BY, "it hangs")
     det.die()
     assert driver.state(lease) == "over"
-    other, _ = held_bytes(driver, "det", 5 * GIB)
+    other, _ = held(driver, "det", 5)
     assert signals(order_of(ops, "kill", "det")) == [(other.process, "term")]
 
 
@@ -429,8 +396,8 @@ def test_no_process_is_killed_in_the_middle_of_anothers_use(
     driver: CoreDriver, ops: Consumer
 ) -> None:
     """A robot may be moving: the runner uses the policy's lease, and holds one to render with."""
-    policy, lease = held_bytes(driver, "policy", 4 * GIB)
-    runner, rendering = held_bytes(driver, "runner", GIB)
+    policy, lease = held(driver, "policy", 4)
+    runner, rendering = held(driver, "runner", 1)
     runner.use_begin(lease, "goal", policy.token(lease))
     for name in ("policy", "runner"):
         effects = order_of(ops, "kill", name)
@@ -444,6 +411,6 @@ def test_no_process_is_killed_in_the_middle_of_anothers_use(
 
 
 def test_what_holds_nothing_is_not_killed(driver: CoreDriver, ops: Consumer) -> None:
-    held_bytes(driver, "det", 5 * GIB, evictable=False)
+    held(driver, "det", 5, evictable=False)
     driver.consumer("waits").acquire(5 * GIB)
     assert refusal(order_of(ops, "kill", "waits")).details["problem"] == "not_held"

@@ -4,6 +4,7 @@ nobody is granted before."""
 from typing import Any
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.scenes import give_back
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.events import (
     Asked,
@@ -33,8 +34,7 @@ def held_with_token(
     return person, lease, token
 
 
-def test_a_kept_lease_keeps_its_token_its_uses_and_its_charge() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_kept_lease_keeps_its_token_its_uses_and_its_charge(driver: CoreDriver) -> None:
     det, lease, token = held_with_token(driver, "det", 5)
     driver.restart()
     assert driver.status()["phase"] == "recovering"
@@ -73,8 +73,7 @@ def test_re_attaching_to_a_daemon_that_did_not_restart_only_moves_the_connection
     assert answer(det.reattach(lease, token, uses=["late"]))["leases"][0]["lease"]["uses"] == 0, (
         "it unloads"
     )
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, det, lease)
     (gone,) = answer(det.reattach(lease, token))["leases"]
     assert gone["error"]["code"] == "bad_state"
 
@@ -106,8 +105,7 @@ def test_a_re_attachment_keeps_the_uses_that_others_began_again_before_it() -> N
     driver.until(lambda: driver.state(vlm) == "loading")
 
 
-def test_wrong_tokens_and_wrong_processes_are_not_kept() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_wrong_tokens_and_wrong_processes_are_not_kept(driver: CoreDriver) -> None:
     det, lease, token = held_with_token(driver, "det", 5)
     thief = driver.consumer("thief")
     spec = det.specs[lease]
@@ -120,8 +118,7 @@ def test_wrong_tokens_and_wrong_processes_are_not_kept() -> None:
     assert unknown["error"]["code"] == "lease_lost", "only while recovering is anybody believed"
 
 
-def test_a_ready_that_was_lost_with_the_daemon_is_made_up_for() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_ready_that_was_lost_with_the_daemon_is_made_up_for(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     lease = det.acquire(5 * GIB, 4 * GIB)
     token = det.token(lease)
@@ -155,9 +152,8 @@ def test_an_acquire_repeated_after_a_restart_reattaches_the_lease_that_it_finds(
     assert driver.state(lease) == "held"
 
 
-def test_a_renewal_without_a_reattachment_is_refused() -> None:
+def test_a_renewal_without_a_reattachment_is_refused(driver: CoreDriver) -> None:
     """Regression: it was answered as alive, while the lease's time to live ran on to its end."""
-    driver = CoreDriver(8 * GIB)
     det, lease, token = held_with_token(driver, "det", 5, ttl_s=10.0)
     driver.restart()
     det.connect()
@@ -172,8 +168,7 @@ def test_a_renewal_without_a_reattachment_is_refused() -> None:
     assert answer(det.renew((lease, token)))["alive"] == [lease]
 
 
-def test_a_holder_that_never_comes_back_expires_and_is_measured_away() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_holder_that_never_comes_back_expires_and_is_measured_away(driver: CoreDriver) -> None:
     _, lease, _ = held_with_token(driver, "det", 5, ttl_s=10.0)
     driver.restart()
     waiter = driver.consumer("vlm").acquire(5 * GIB)
@@ -186,19 +181,13 @@ def test_a_holder_that_never_comes_back_expires_and_is_measured_away() -> None:
     assert driver.journal.keys() == {f"lease:{waiter}"}
 
 
-def test_whoever_has_not_come_back_is_named() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_whoever_has_not_come_back_is_named(driver: CoreDriver) -> None:
     for n in range(5):
         held_with_token(driver, f"m{n}", 1)
     driver.restart()
     block = driver.gpu()["blocked"]
     assert [name.split(" ")[0] for name in block["names"]] == ["m0", "m1", "m2"]
     assert (block["code"], block["more"]) == ("recovering", 2)
-    driver = CoreDriver(8 * GIB)
-    driver.device.set(driver.consumer("x").process, 1 * GIB, driver.now)
-    driver.post(Recovered({}))
-    block = driver.gpu()["blocked"]
-    assert (block["code"], block.get("names")) == ("recovering", None), "they are not known"
 
 
 def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> None:
@@ -215,10 +204,9 @@ def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> No
     assert driver.state(lease) == "over"
 
 
-def test_an_empty_gpu_takes_no_lease_from_a_living_holder() -> None:
+def test_an_empty_gpu_takes_no_lease_from_a_living_holder(driver: CoreDriver) -> None:
     """A reading that says that the GPU is empty may lie, and a model may sleep in host RAM. Nobody
     has to be waited for there, that is all."""
-    driver = CoreDriver(8 * GIB)
     det, lease, token = held_with_token(driver, "det", 5, ttl_s=10.0)
     loader = driver.consumer("loader")
     loading = loader.acquire(1 * GIB)
@@ -243,8 +231,7 @@ def test_an_empty_gpu_takes_no_lease_from_a_living_holder() -> None:
     assert driver.state(lease) == "held"
 
 
-def test_who_does_not_come_back_to_an_empty_gpu_is_given_up_in_time() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_who_does_not_come_back_to_an_empty_gpu_is_given_up_in_time(driver: CoreDriver) -> None:
     _, lease, _ = held_with_token(driver, "det", 5, ttl_s=10.0)
     driver.device.held.clear()
     driver.restart()
@@ -274,8 +261,7 @@ def test_who_lets_go_after_a_restart_without_coming_back_is_waited_for_no_longer
     assert (driver.state(lease), driver.state(other)) == ("held", "over")
 
 
-def test_verifications_and_debts_go_on_after_the_restart() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_verifications_and_debts_go_on_after_the_restart(driver: CoreDriver) -> None:
     driver.device.lag_s = 3.0
     det, lease, token = held_with_token(driver, "det", 4, residue_bytes=450 * MIB)
     vlm, other, _ = held_with_token(driver, "vlm", 2)
@@ -296,10 +282,9 @@ def test_verifications_and_debts_go_on_after_the_restart() -> None:
     assert token.epoch == 1
 
 
-def test_a_debt_keeps_its_fence_grace_over_a_restart() -> None:
+def test_a_debt_keeps_its_fence_grace_over_a_restart(driver: CoreDriver) -> None:
     """Regression: the hung holder may still be loading until it fences itself; a restart forgot
     that and gave its room away."""
-    driver = CoreDriver(8 * GIB)
     hung = driver.consumer("hung")
     lease = hung.acquire(5 * GIB, ttl_s=2.0)
     driver.until(lambda: driver.state(lease) == "over", limit_s=5.0)
@@ -310,8 +295,7 @@ def test_a_debt_keeps_its_fence_grace_over_a_restart() -> None:
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
 
 
-def test_a_lost_journal_believes_holders_for_a_while() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_lost_journal_believes_holders_for_a_while(driver: CoreDriver) -> None:
     det, lease, token = held_with_token(driver, "det", 5)
     loader = driver.consumer("loader")
     loading = loader.acquire(2 * GIB)
@@ -343,8 +327,7 @@ def test_a_lost_journal_believes_holders_for_a_while() -> None:
     assert f"lease:{lease}" in driver.journal
 
 
-def test_adopting_more_than_the_gpu_has_is_pressure_not_a_crash() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_adopting_more_than_the_gpu_has_is_pressure_not_a_crash(driver: CoreDriver) -> None:
     det, lease, token = held_with_token(driver, "det", 5)
     driver.restart(keep_journal=False)
     liar = driver.consumer("liar")
@@ -356,8 +339,7 @@ def test_adopting_more_than_the_gpu_has_is_pressure_not_a_crash() -> None:
     assert "revoking" in {driver.state(lease), driver.state(LeaseId("L1-50"))}
 
 
-def test_a_lost_journal_and_an_empty_gpu_serve_at_once() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_lost_journal_and_an_empty_gpu_serve_at_once(driver: CoreDriver) -> None:
     driver.restart(keep_journal=False)
     assert driver.status()["phase"] == "serving"
     assert driver.consumer("det").acquire(5 * GIB)
@@ -370,8 +352,7 @@ def test_one_empty_gpu_of_two_is_not_enough() -> None:
     assert driver.status()["phase"] == "recovering"
 
 
-def test_records_of_a_gpu_that_is_gone_are_dropped() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_records_of_a_gpu_that_is_gone_are_dropped(driver: CoreDriver) -> None:
     record = ResidueRecord(pid=1, start_ticks=1, gpu="GPU-old", residue_bytes=5)
     effects = driver.post(Recovered({"residue:1@1:GPU-old": record}))
     assert type(effects[0]).__name__ == "JournalDelete"
@@ -379,8 +360,7 @@ def test_records_of_a_gpu_that_is_gone_are_dropped() -> None:
     assert effects[-1].kind == "serving"
 
 
-def test_a_reading_from_before_the_restart_voids_nothing() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_reading_from_before_the_restart_voids_nothing(driver: CoreDriver) -> None:
     _, lease, _ = held_with_token(driver, "det", 5)
     records = dict(driver.journal)
     driver = CoreDriver(8 * GIB, start=False)
@@ -390,8 +370,7 @@ def test_a_reading_from_before_the_restart_voids_nothing() -> None:
     driver.post(MemorySampled(GpuId("GPU-9"), driver.now, 0, 8 * GIB, ()))
 
 
-def test_the_first_verdict_after_a_restart_needs_no_reading_from_before() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_the_first_verdict_after_a_restart_needs_no_reading_from_before(driver: CoreDriver) -> None:
     det, lease, _ = held_with_token(driver, "det", 5)
     other = driver.consumer("other")
     driver.device.set(other.process, 1 * GIB, driver.now)
@@ -410,10 +389,9 @@ def test_the_first_verdict_after_a_restart_needs_no_reading_from_before() -> Non
     )
 
 
-def test_records_that_a_full_disk_kept_may_say_more_than_the_gpu_has() -> None:
+def test_records_that_a_full_disk_kept_may_say_more_than_the_gpu_has(driver: CoreDriver) -> None:
     """They used to break the invariant on bytes at the start, and the whole journal was put aside
     for it."""
-    driver = CoreDriver(8 * GIB)
     _, lease, _ = held_with_token(driver, "det", 5)
     records = dict(driver.journal)
     other = driver.consumer("other")

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import CoreDriver, answer, refusal
+from tests.support.scenes import held, shown
 from vram_arbiter.arbiter.core.effects import JournalPut, Note, Push, Reply, Sample
 from vram_arbiter.arbiter.core.events import Asked
 from vram_arbiter.arbiter.core.model.records import LeaseRecord
@@ -240,9 +241,7 @@ def test_no_new_use_once_the_holder_was_asked(driver: CoreDriver) -> None:
 
 # -- renew
 def test_renewing_keeps_alive_and_never_resurrects(driver: CoreDriver) -> None:
-    det = driver.consumer("det")
-    lease = det.acquire(5 * GIB, ttl_s=10.0, min_residency_s=100.0)
-    det.load(lease)
+    det, lease = held(driver, "det", 5, ttl_s=10.0, min_residency_s=100.0)
     queued = det.acquire(5 * GIB)
     token = det.token(lease)
     driver.advance(9.0)
@@ -259,6 +258,7 @@ def test_renewing_keeps_alive_and_never_resurrects(driver: CoreDriver) -> None:
     assert driver.state(lease) == "over"
     (gone,) = answer(det.renew((lease, token)))["gone"]
     assert gone["error"]["code"] == "lease_expired"
+    assert gone["error"]["details"].keys() == {"lease_id", "ttl_s"}, "for the usual reason"
     assert driver.pushes("lost", lease)[0]["error"]["code"] == "lease_expired"
     assert driver.state(lease) == "over"
 
@@ -276,6 +276,7 @@ def test_unloading_waits_for_the_safe_point_whoever_marked_the_use(driver: CoreD
     runner.use_end(lease, "goal", det.token(lease))
     assert kinds(det.unloading(lease)) == ["Reply", "Note:unloading"]
     assert kinds(det.unloading(lease)) == ["Reply"], "a repeat"
+    assert driver.notes("unloading")[0]["asked"] is False
 
 
 def test_release_may_be_repeated_before_and_after_the_verdict(driver: CoreDriver) -> None:
@@ -317,8 +318,7 @@ def test_an_out_of_memory_raises_the_learnt_peak_of_its_model(driver: CoreDriver
     det.release(lease)
     driver.advance(1.0)
     again = det.acquire(2 * GIB)
-    view = driver.view(again)
-    assert view is not None
+    view = shown(driver, again)
     assert view["charge_bytes"] == 3 * GIB
     assert (
         answer(det.oom(again, 100 * GIB, 1 * GIB))["learnt_load_peak_bytes"]

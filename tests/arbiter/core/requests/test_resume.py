@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from tests.support.core_driver import CoreDriver, answer
-from tests.support.scenes import held
+from tests.support.scenes import held, in_use
 from vram_arbiter.arbiter.core.effects import Note, Sample
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessDied, Resumed
 from vram_arbiter.schemas import defaults as d
@@ -15,10 +15,9 @@ GIB = d.GIB
 NIGHT_S = 8 * 3600.0
 
 
-def test_every_holder_gets_its_full_ttl_anew_and_none_expires() -> None:
+def test_every_holder_gets_its_full_ttl_anew_and_none_expires(driver: CoreDriver) -> None:
     """They wake up in any order, behind a driver that takes its time: the first to be late must not
     lose its lease for it."""
-    driver = CoreDriver(8 * GIB)
     holders = [held(driver, name, 1, ttl_s=10.0) for name in ("a", "b", "c")]
     driver.advance(8.0)  # of ten
     driver.post(Resumed(NIGHT_S))
@@ -31,9 +30,8 @@ def test_every_holder_gets_its_full_ttl_anew_and_none_expires() -> None:
     )
 
 
-def test_nothing_is_granted_on_a_reading_from_before() -> None:
+def test_nothing_is_granted_on_a_reading_from_before(driver: CoreDriver) -> None:
     """Regression: by the monotonic clock yesterday's reading is a second old."""
-    driver = CoreDriver(8 * GIB)
     person = driver.consumer("a")
     driver.advance(0.01)
     driver.device.failing = "the driver wakes up too"
@@ -46,8 +44,7 @@ def test_nothing_is_granted_on_a_reading_from_before() -> None:
     driver.until(lambda: driver.state(lease) == "loading")
 
 
-def test_a_reading_that_began_before_the_night_does_not_count() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_reading_that_began_before_the_night_does_not_count(driver: CoreDriver) -> None:
     began = driver.now
     driver.advance(0.5)
     driver.device.silent = True
@@ -66,10 +63,9 @@ def newest(driver: CoreDriver, kind: str) -> Mapping[str, Any]:
     return next(to_map(note.body) for note in notes if note.kind == kind)
 
 
-def test_a_verification_begins_again() -> None:
+def test_a_verification_begins_again(driver: CoreDriver) -> None:
     """Its time is up by what it waited for before; the readings of a new day decide, with the whole
     time for them."""
-    driver = CoreDriver(8 * GIB)
     driver.device.lag_s = 1000.0
     person, lease = held(driver, "a", 5, ttl_s=10.0)
     person.unload(lease)
@@ -90,8 +86,7 @@ def test_a_verification_begins_again() -> None:
     assert driver.state(second) == "over"
 
 
-def test_a_recovery_that_was_under_way_waits_for_its_holders_anew() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_recovery_that_was_under_way_waits_for_its_holders_anew(driver: CoreDriver) -> None:
     person, lease = held(driver, "a", 5, ttl_s=10.0)
     token = person.token(lease)
     driver.restart()
@@ -102,8 +97,7 @@ def test_a_recovery_that_was_under_way_waits_for_its_holders_anew() -> None:
     assert answer(person.reattach(lease, token))["leases"][0]["kept"]
 
 
-def test_a_recovery_without_a_journal_waits_anew_too() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_recovery_without_a_journal_waits_anew_too(driver: CoreDriver) -> None:
     held(driver, "a", 5, ttl_s=10.0)
     driver.restart(keep_journal=False)
     driver.advance(14.0)
@@ -114,10 +108,8 @@ def test_a_recovery_without_a_journal_waits_anew_too() -> None:
     assert driver.status()["phase"] == "serving"
 
 
-def test_waiters_and_leases_on_their_way_out_keep_their_place() -> None:
-    driver = CoreDriver(8 * GIB)
-    holder, lease = held(driver, "a", 5, ttl_s=3600.0)
-    holder.use_begin(lease)
+def test_waiters_and_leases_on_their_way_out_keep_their_place(driver: CoreDriver) -> None:
+    holder, lease = in_use(driver, "a", 5, ttl_s=3600.0)
     waiter = driver.consumer("b").acquire(5 * GIB, wait_timeout_s=20.0)
     driver.until(lambda: driver.state(lease) == "revoking")
     effects = driver.post(Resumed(NIGHT_S))

@@ -1,6 +1,7 @@
 """Connections that come and go, deaths, and a journal that fails."""
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.scenes import give_back, held
 from vram_arbiter.arbiter.core.effects import Note, Push, Refuse
 from vram_arbiter.arbiter.core.events import (
     ClientConnected,
@@ -14,8 +15,7 @@ from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
 GIB = d.GIB
 
 
-def test_a_first_client_makes_the_gpu_be_read_if_the_reading_is_old() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_first_client_makes_the_gpu_be_read_if_the_reading_is_old(driver: CoreDriver) -> None:
     driver.advance(60.0)
     assert driver.arbiter.next_deadline() is None, "nobody is interested: the GPU is left alone"
     det = driver.consumer("det")
@@ -24,8 +24,7 @@ def test_a_first_client_makes_the_gpu_be_read_if_the_reading_is_old() -> None:
     assert det.connect() == []
 
 
-def test_bye_gives_everything_back() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_bye_gives_everything_back(driver: CoreDriver) -> None:
     det, runner = driver.consumer("det"), driver.consumer("runner")
     held = det.acquire(2 * GIB)
     det.load(held)
@@ -68,8 +67,7 @@ def test_a_use_that_was_repeated_on_a_new_connection_outlives_the_old_one() -> N
     assert driver.notes("use_ended")
 
 
-def test_pushes_go_to_another_living_connection_of_the_process() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_pushes_go_to_another_living_connection_of_the_process(driver: CoreDriver) -> None:
     first = driver.consumer("det", pid=500)
     held = first.acquire(5 * GIB)
     first.load(held)
@@ -113,25 +111,20 @@ def test_a_death_ends_leases_waits_and_uses_and_its_bytes_are_measured_away() ->
     )
 
 
-def test_a_death_during_verification_needs_no_residue_any_more() -> None:
-    driver = CoreDriver(8 * GIB)
-    det = driver.consumer("det")
-    held = det.acquire(5 * GIB, residue_bytes=1 * GIB)
-    det.load(held)
-    det.unload(held)
+def test_a_death_during_verification_needs_no_residue_any_more(driver: CoreDriver) -> None:
+    det, lease = held(driver, "det", 5, residue_bytes=1 * GIB)
+    det.unload(lease)
     det.die()
-    driver.until(lambda: driver.state(held) == "over")
+    driver.until(lambda: driver.state(lease) == "over")
     assert driver.gpu()["charged_bytes"] == 0
     assert driver.journal == {}
 
 
-def test_the_residue_of_a_dead_process_is_measured_away_too() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_the_residue_of_a_dead_process_is_measured_away_too(driver: CoreDriver) -> None:
     det, big = driver.consumer("det"), driver.consumer("big")
     held = det.acquire(5 * GIB, residue_bytes=1 * GIB)
     det.load(held)
-    det.unload(held)
-    driver.until(lambda: driver.state(held) == "over")
+    give_back(driver, det, held)
     assert driver.gpu()["charged_bytes"] == 1 * GIB
     assert list(driver.journal) == [f"residue:{det.process}:GPU-0"]
     waiting = big.acquire(7 * GIB)
@@ -143,8 +136,7 @@ def test_the_residue_of_a_dead_process_is_measured_away_too() -> None:
     assert driver.notes("verified")[-1]["lease_id"] is None
 
 
-def test_a_grant_that_cannot_be_written_is_taken_back() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_grant_that_cannot_be_written_is_taken_back(driver: CoreDriver) -> None:
     det, vlm = driver.consumer("det"), driver.consumer("vlm")
     held = det.acquire(5 * GIB)
     waiting = vlm.acquire(5 * GIB)
@@ -159,14 +151,10 @@ def test_a_grant_that_cannot_be_written_is_taken_back() -> None:
     assert driver.gpu()["charged_bytes"] == 0, "nothing stays charged for it"
 
 
-def test_a_grant_taken_back_leaves_the_residue_of_its_process_charged() -> None:
+def test_a_grant_taken_back_leaves_the_residue_of_its_process_charged(driver: CoreDriver) -> None:
     """Regression: with the grant the ledger forgot the context that the process had all along."""
-    driver = CoreDriver(8 * GIB)
-    det = driver.consumer("det")
-    lease = det.acquire(5 * GIB, residue_bytes=1 * GIB)
-    det.load(lease)
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    det, lease = held(driver, "det", 5, residue_bytes=1 * GIB)
+    give_back(driver, det, lease)
     driver.restart()
     det.connect()
     driver.until(lambda: bool(driver.notes("serving")), limit_s=30.0)
@@ -177,8 +165,7 @@ def test_a_grant_taken_back_leaves_the_residue_of_its_process_charged() -> None:
     assert driver.gpu()["charged_bytes"] == 1 * GIB
 
 
-def test_a_grant_in_reply_that_cannot_be_written_is_refused_once() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_grant_in_reply_that_cannot_be_written_is_refused_once(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     driver.journal_failing = "disk full"
     det.try_acquire(5 * GIB)
@@ -189,8 +176,7 @@ def test_a_grant_in_reply_that_cannot_be_written_is_refused_once() -> None:
     assert notes[-2:] == ["journal_failed", "denied"]
 
 
-def test_other_records_that_fail_are_noted_and_nothing_else() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_other_records_that_fail_are_noted_and_nothing_else(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     held = det.acquire(5 * GIB)
     driver.journal_failing = "disk full"
@@ -200,10 +186,9 @@ def test_other_records_that_fail_are_noted_and_nothing_else() -> None:
     assert [type(effect) for effect in effects] == [Note]
 
 
-def test_a_loading_holder_is_not_undone_by_a_later_record() -> None:
+def test_a_loading_holder_is_not_undone_by_a_later_record(driver: CoreDriver) -> None:
     """Regression: a pin that a full disk did not take withdrew the lease of a holder that was
     loading, and its bytes were given away."""
-    driver = CoreDriver(8 * GIB)
     det, ops = driver.consumer("det"), driver.consumer("ops")
     loading = det.acquire(5 * GIB)
     driver.journal_failing = "disk full"
@@ -214,19 +199,15 @@ def test_a_loading_holder_is_not_undone_by_a_later_record() -> None:
     assert not driver.pushes("denied")
 
 
-def test_a_release_is_told_though_its_record_fails() -> None:
-    driver = CoreDriver(8 * GIB)
-    det = driver.consumer("det")
-    held = det.acquire(5 * GIB)
-    det.load(held)
+def test_a_release_is_told_though_its_record_fails(driver: CoreDriver) -> None:
+    det, lease = held(driver, "det", 5)
     driver.journal_failing = "disk full"
     det.hold(0)
-    answer(det.release(held))
+    answer(det.release(lease))
     assert driver.notes("released")
 
 
-def test_strangers_to_the_core_die_unmourned() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_strangers_to_the_core_die_unmourned(driver: CoreDriver) -> None:
     assert driver.post(ProcessDied(ProcessKey(1, 1))) == []
     assert driver.post(ClientLeft(ClientId("x"), "bye")) == []
     assert driver.state(LeaseId("L1-1")) == "over"
@@ -239,6 +220,7 @@ def test_who_owns_bytes_of_a_gpu_and_who_is_connected() -> None:
     assert driver.arbiter.owners(first) == frozenset(), "nobody holds a lease"
     assert driver.arbiter.clients() == {det.process, watcher.process}
     lease = det.acquire(2 * GIB, gpu=first)
+    assert [driver.arbiter.concerns(one.client) for one in (det, watcher)] == [True, False]
     det.load(lease)
     assert (driver.arbiter.owners(first), driver.arbiter.owners(second)) == (
         {det.process},
@@ -280,8 +262,7 @@ def test_an_instance_that_reconnects_is_one_client_with_everything_that_was_its_
     )
 
 
-def test_a_connection_that_says_hello_as_another_instance_is_only_that() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_connection_that_says_hello_as_another_instance_is_only_that(driver: CoreDriver) -> None:
     det = driver.consumer("det")
     driver.post(ClientConnected(det.client, det.process, 1000, "det", "second"))
     back = ClientId("back")

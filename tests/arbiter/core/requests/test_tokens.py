@@ -15,8 +15,7 @@ GIB = d.GIB
 SECRET = "5e" * 16
 
 
-def test_a_token_is_shown_to_its_holder_and_to_an_operator_only() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_token_is_shown_to_its_holder_and_to_an_operator_only(driver: CoreDriver) -> None:
     det, lease = driver.consumer("det"), None
     lease = det.acquire(5 * GIB)
     token = det.token(lease)

@@ -56,10 +56,9 @@ def writes(effects: list[Effect]) -> list[list[str]]:
 
 
 # -- after a restart
-def test_a_user_that_is_stopped_across_a_restart_keeps_its_holder() -> None:
+def test_a_user_that_is_stopped_across_a_restart_keeps_its_holder(driver: CoreDriver) -> None:
     """Regression: only its own client could mark the use again, and a holder was sent away in the
     middle of a grab."""
-    driver = CoreDriver(8 * GIB)
     sidecar, lease, token, runner = used(driver)
     restarted(driver, sidecar, lease, token)
     assert driver.status()["phase"] == "serving", "nobody waits for the user to come back"
@@ -103,9 +102,8 @@ def test_a_use_that_ended_while_the_daemon_was_away_is_over_when_its_process_say
 
 @pytest.mark.parametrize(("ttl_s", "patience_s"), [(30.0, 35.0), (2.0, PATIENCE_S)])
 def test_a_user_that_does_not_come_back_is_waited_for_as_long_as_a_silent_holder(
-    ttl_s: float, patience_s: float
+    driver: CoreDriver, ttl_s: float, patience_s: float
 ) -> None:
-    driver = CoreDriver(8 * GIB)
     sidecar, lease, token, _ = used(driver, ttl_s=ttl_s)
     driver.restart()
     began = driver.now - 0.01
@@ -123,8 +121,7 @@ def test_a_user_that_does_not_come_back_is_waited_for_as_long_as_a_silent_holder
     driver.until(lambda: driver.state(vlm) == "loading")
 
 
-def test_only_the_user_that_did_not_come_back_is_given_up() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_only_the_user_that_did_not_come_back_is_given_up(driver: CoreDriver) -> None:
     sidecar, lease, token, runner = used(driver)
     driver.consumer("watcher").use_begin(lease, "watch", token)
     restarted(driver, sidecar, lease, token)
@@ -137,8 +134,7 @@ def test_only_the_user_that_did_not_come_back_is_given_up() -> None:
     assert writes(driver.effects)[-1] == ["goal"]
 
 
-def test_a_suspend_after_the_restart_gives_the_user_its_whole_time_anew() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_suspend_after_the_restart_gives_the_user_its_whole_time_anew(driver: CoreDriver) -> None:
     sidecar, lease, token, _ = used(driver)
     restarted(driver, sidecar, lease, token)
     live_on(driver, sidecar, lease, token, PATIENCE_S - 1.0)
@@ -151,10 +147,9 @@ def test_a_suspend_after_the_restart_gives_the_user_its_whole_time_anew() -> Non
     assert ("users", lease) not in driver.arbiter.inspect().timers, "nobody is waited for any more"
 
 
-def test_a_holder_that_was_asked_and_is_used_is_not_taken_for_gone() -> None:
+def test_a_holder_that_was_asked_and_is_used_is_not_taken_for_gone(driver: CoreDriver) -> None:
     """Regression: records written after a first restart forgot that the holder had been revoked,
     and a standby lease did not return."""
-    driver = CoreDriver(8 * GIB)
     sidecar, lease, token, runner = used(driver, standby=True)
     driver.consumer("vlm").acquire(5 * GIB, priority=90)
     assert driver.journal[f"lease:{lease}"]["state"] == "revoking"
@@ -171,8 +166,7 @@ def test_a_holder_that_was_asked_and_is_used_is_not_taken_for_gone() -> None:
     assert answer(sidecar.unload(lease))["next"] == "standby"
 
 
-def test_a_record_of_an_older_daemon_names_no_users() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_record_of_an_older_daemon_names_no_users(driver: CoreDriver) -> None:
     sidecar, lease, token, _ = used(driver)
     record = dict(driver.journal[f"lease:{lease}"])
     del record["users"]
@@ -182,8 +176,7 @@ def test_a_record_of_an_older_daemon_names_no_users() -> None:
 
 
 # -- what it costs
-def test_the_holders_own_uses_are_not_written() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_the_holders_own_uses_are_not_written(driver: CoreDriver) -> None:
     sidecar, lease = held(driver, "sidecar", 5)
     for use in ("u1", "u2"):
         assert writes(sidecar.use_begin(lease, use)) == []
@@ -191,8 +184,7 @@ def test_the_holders_own_uses_are_not_written() -> None:
         assert writes(sidecar.use_end(lease, use)) == []
 
 
-def test_one_use_of_each_other_process_is_written_before_it_is_answered() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_one_use_of_each_other_process_is_written_before_it_is_answered(driver: CoreDriver) -> None:
     sidecar, lease, token, runner = used(driver, ())
     sidecar.use_begin(lease, "own")
     effects = runner.use_begin(lease, "u1", token, "grab")
@@ -218,8 +210,7 @@ def _key(person: Consumer) -> tuple[int, int]:
     return person.process.pid, person.process.start_ticks
 
 
-def test_whatever_is_written_of_a_lease_names_its_users() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_whatever_is_written_of_a_lease_names_its_users(driver: CoreDriver) -> None:
     sidecar, lease, token, runner = used(driver)
     sidecar.order("pin", lease, "", "ada")
     assert writes(driver.effects)[-1] == ["goal"]

@@ -4,7 +4,7 @@ pressure, several GPUs."""
 import pytest
 
 from tests.support.core_driver import CoreDriver, answer
-from tests.support.scenes import held
+from tests.support.scenes import give_back, held, in_use
 from vram_arbiter.arbiter.core.effects import Sample
 from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.schemas import defaults as d
@@ -15,8 +15,7 @@ STRANGER = ProcessKey(9, 9)
 
 
 # -- order and backfill
-def test_a_higher_priority_passes_and_equals_keep_their_order() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_higher_priority_passes_and_equals_keep_their_order(driver: CoreDriver) -> None:
     det, lease = driver.consumer("det"), LeaseId("")
     lease = det.acquire(6 * GIB)
     low = driver.consumer("low").acquire(6 * GIB)
@@ -27,10 +26,8 @@ def test_a_higher_priority_passes_and_equals_keep_their_order() -> None:
     assert driver.state(low) == "queued"
 
 
-def test_a_small_one_passes_the_head_if_it_cannot_delay_it() -> None:
-    driver = CoreDriver(8 * GIB)
-    busy, busy_lease = held(driver, "busy", 4)
-    busy.use_begin(busy_lease)
+def test_a_small_one_passes_the_head_if_it_cannot_delay_it(driver: CoreDriver) -> None:
+    busy, busy_lease = in_use(driver, "busy", 4)
     head = driver.consumer("head").acquire(5 * GIB)
     assert driver.state(busy_lease) == "revoking"
     small = driver.consumer("small")
@@ -49,8 +46,7 @@ def test_a_small_one_passes_the_head_if_it_cannot_delay_it() -> None:
 
 def test_nobody_passes_an_exclusive_head_or_when_its_room_is_about_to_come() -> None:
     driver = CoreDriver(8 * GIB)
-    busy, busy_lease = held(driver, "busy", 4)
-    busy.use_begin(busy_lease)
+    in_use(driver, "busy", 4)
     alone = driver.consumer("alone")
     head = alone.acquire(1 * GIB, exclusive=True)
     small = driver.consumer("small").acquire(1 * GIB)
@@ -77,10 +73,8 @@ def test_while_the_head_s_victim_unloads_nobody_starts_a_load_in_between() -> No
     driver.until(lambda: driver.state(head) == "loading")
 
 
-def test_an_exclusive_waiter_never_passes() -> None:
-    driver = CoreDriver(8 * GIB)
-    busy, busy_lease = held(driver, "busy", 4, priority=90)
-    busy.use_begin(busy_lease)
+def test_an_exclusive_waiter_never_passes(driver: CoreDriver) -> None:
+    in_use(driver, "busy", 4, priority=90)
     head = driver.consumer("head").acquire(5 * GIB)
     alone = driver.consumer("alone").acquire(1 * GIB, exclusive=True)
     third = driver.consumer("third").acquire(2 * GIB)
@@ -110,11 +104,9 @@ def test_the_debt_of_an_exclusive_holder_keeps_the_gpu_to_itself(end: str) -> No
     assert not driver.device.shown(driver.now)
 
 
-def test_residues_may_stay_beside_an_exclusive_lease() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_residues_may_stay_beside_an_exclusive_lease(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, det, lease)
     alone = driver.consumer("alone").acquire(7 * GIB, exclusive=True)
     driver.advance(0.01)
     assert driver.state(alone) == "loading"
@@ -137,10 +129,9 @@ def test_an_old_reading_carries_no_grant_a_fresh_one_is_asked_for() -> None:
     ]
 
 
-def test_the_gpu_may_say_no_where_the_ledger_says_yes() -> None:
+def test_the_gpu_may_say_no_where_the_ledger_says_yes(driver: CoreDriver) -> None:
     """Total-only backend: bytes that appear while somebody loads cannot be explained, but they are
     not free either."""
-    driver = CoreDriver(8 * GIB)
     driver.device.lists_processes = False
     det, lease = held(driver, "det", 1)
     driver.device.set(STRANGER, 4 * GIB, driver.now)
@@ -187,28 +178,11 @@ def test_a_load_peak_that_is_not_back_yet_carries_no_grant() -> None:
     driver.until(lambda: driver.state(vlm) == "loading", limit_s=3.0)
 
 
-def test_an_exclusive_lease_that_expired_keeps_others_out_until_it_is_measured_gone() -> None:
-    """Regression: its debt kept its bytes charged, but a neighbour came in while its hung holder
-    was still on the GPU."""
-    driver = CoreDriver(8 * GIB)
-    hung = driver.consumer("hung")
-    lease = hung.acquire(2 * GIB, exclusive=True, ttl_s=2.0)
-    hung.load(lease)
-    waiter = driver.consumer("w").acquire(1 * GIB, evictable=False)
-    driver.until(lambda: driver.state(lease) == "over", limit_s=5.0)
-    driver.advance(8.0)
-    assert driver.state(waiter) == "queued"
-    hung.hold(0)
-    driver.until(lambda: driver.state(waiter) == "loading", limit_s=10.0)
-
-
 # -- pressure
-def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder(driver: CoreDriver) -> None:
     calm, calm_lease = held(driver, "calm", 2)
     _, other_lease = held(driver, "other", 4)
-    busy, busy_lease = held(driver, "busy", 1)
-    busy.use_begin(busy_lease)
+    _, busy_lease = in_use(driver, "busy", 1)
     driver.device.set(STRANGER, 2 * GIB, driver.now)
     waiter = driver.consumer("w")
     driver.until(lambda: bool(driver.notes("pressure")), limit_s=2.0)
@@ -228,21 +202,17 @@ def test_pressure_stops_grants_and_asks_the_cheapest_idle_holder() -> None:
     assert driver.notes("pressure")[-1]["pressure_bytes"] == 0
 
 
-def test_pressure_that_cannot_be_covered_asks_every_idle_holder() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_pressure_that_cannot_be_covered_asks_every_idle_holder(driver: CoreDriver) -> None:
     _, small = held(driver, "small", 1)
-    busy, busy_lease = held(driver, "busy", 6)
-    busy.use_begin(busy_lease)
+    _, busy_lease = in_use(driver, "busy", 6)
     driver.device.set(STRANGER, 3 * GIB, driver.now)
     driver.until(lambda: driver.state(small) == "revoking", limit_s=2.0)
     assert driver.state(busy_lease) == "held"
     driver.device.total_bytes = 16 * GIB
 
 
-def test_a_holder_above_its_charge_is_pressure_not_a_stowaway() -> None:
-    driver = CoreDriver(8 * GIB)
-    liar, lease = held(driver, "liar", 3)
-    liar.use_begin(lease)
+def test_a_holder_above_its_charge_is_pressure_not_a_stowaway(driver: CoreDriver) -> None:
+    liar, _ = in_use(driver, "liar", 3)
     _, idle = held(driver, "idle", 4, min_residency_s=5.0)
     liar.hold(5 * GIB)
     driver.until(lambda: bool(driver.notes("pressure")), limit_s=2.0)
@@ -253,10 +223,8 @@ def test_a_holder_above_its_charge_is_pressure_not_a_stowaway() -> None:
     driver.until(lambda: driver.state(idle) == "revoking", limit_s=6.0)
 
 
-def test_ready_with_more_than_granted_is_pressure_and_no_violation() -> None:
-    driver = CoreDriver(8 * GIB)
-    a, first = held(driver, "a", 4)
-    a.use_begin(first)
+def test_ready_with_more_than_granted_is_pressure_and_no_violation(driver: CoreDriver) -> None:
+    a, first = in_use(driver, "a", 4)
     b = driver.consumer("b")
     second = b.acquire(3 * GIB)
     driver.until(lambda: driver.state(second) == "loading")
@@ -267,32 +235,6 @@ def test_ready_with_more_than_granted_is_pressure_and_no_violation() -> None:
 
 
 # -- several GPUs
-def test_any_takes_the_first_gpu_where_it_fits_without_asking() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
-    a, b = driver.consumer("a"), driver.consumer("b")
-    first = a.acquire(5 * GIB)
-    second = b.acquire(5 * GIB)
-    assert [view["gpu"] for view in (driver.view(first), driver.view(second)) if view] == [
-        "GPU-0",
-        "GPU-1",
-    ]
-
-
-def test_any_empties_the_cheaper_gpu_only() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
-    dear, dear_lease = held(driver, "dear", 5, priority=80, gpu="0")
-    cheap, cheap_lease = held(driver, "cheap", 5, priority=20, gpu="1")
-    person = driver.consumer("w")
-    waiter = person.acquire(5 * GIB)
-    assert (driver.state(dear_lease), driver.state(cheap_lease)) == ("held", "revoking")
-    driver.advance(5.0)
-    assert driver.state(dear_lease) == "held"
-    cheap.unload(cheap_lease)
-    driver.until(lambda: driver.state(waiter) == "loading")
-    view = driver.view(waiter)
-    assert view is not None
-    assert view["gpu"] == "GPU-1"
-    assert dear.driver is driver
 
 
 def test_any_waits_for_room_that_comes_on_another_gpu() -> None:
@@ -312,16 +254,14 @@ def test_any_waits_for_room_that_comes_on_another_gpu() -> None:
 def test_the_dearer_gpu_is_emptied_if_the_cheaper_one_is_not_its_turn() -> None:
     driver = CoreDriver(8 * GIB, gpus=2)
     _, dear = held(driver, "dear", 5, priority=80, gpu="0")
-    cheap, cheap_lease = held(driver, "cheap", 5, priority=20, gpu="1")
-    cheap.use_begin(cheap_lease)
+    in_use(driver, "cheap", 5, priority=20, gpu="1")
     driver.consumer("first").acquire(5 * GIB, gpu="1", priority=60)
     waiter = driver.consumer("w").acquire(5 * GIB)
     assert driver.state(dear) == "revoking"
     assert driver.state(waiter) == "queued"
 
 
-def test_readings_of_unknown_gpus_and_late_ones_are_dropped() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_readings_of_unknown_gpus_and_late_ones_are_dropped(driver: CoreDriver) -> None:
     assert driver.post(MemorySampled(GpuId("GPU-9"), driver.now, 0, 1, None)) == []
     driver.post(MemorySampled(GpuId("GPU-0"), driver.now, 123, 8 * GIB, ()))
     driver.post(MemorySampled(GpuId("GPU-0"), driver.now - 5.0, 456, 8 * GIB, ()))

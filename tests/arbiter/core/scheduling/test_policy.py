@@ -51,26 +51,62 @@ class Scene:
         return next(iter(state_of(self.driver.arbiter).gpus.values()))
 
 
-def test_nobody_is_asked_if_it_fits() -> None:
+def has(name: str, gib: float, *, used: bool = False, **spec: Any) -> dict[str, Any]:
+    return {"name": name, "gib": gib, "used": used, **spec}
+
+
+WEAKER = [
+    has("low", 1, priority=10),
+    has("mid", 2, priority=20),
+    has("high", 4, priority=30),
+]
+VICTIMS: dict[str, tuple[list[dict[str, Any]], dict[str, Any], set[str]]] = {
+    "it fits": ([has("a", 3)], {"gib": 5}, set()),
+    "one that covers is better than two": (
+        [has("small", 1), has("medium", 2), has("large", 4)], {"gib": 5}, {"large"},
+    ),
+    "of equals the one that wastes least": (
+        [has("three", 3), has("four", 4)], {"gib": 4}, {"three"},
+    ),
+    "lower priority before better size": (
+        [has("exact", 3, priority=60), has("cheap", 4, priority=40)], {"gib": 4}, {"cheap"},
+    ),
+    "lower classes if they are enough": (WEAKER, {"gib": 4}, {"low", "mid"}),
+    "a higher class if not": (WEAKER, {"gib": 5}, {"high"}),
+    "idle before in use, even if more have to": (
+        [has("a", 2), has("b", 2), has("busy", 4, used=True)], {"gib": 4}, {"a", "b"},
+    ),
+    "in vain: the idle one alone would not be enough": (
+        [has("busy", 4, priority=90, used=True), has("idle", 2)], {"gib": 5}, set(),
+    ),
+    "a fresh one that would not help is not waited for": (
+        [has("busy", 5, used=True), has("fresh", 0.5, min_residency_s=2.0)], {"gib": 4}, {"busy"},
+    ),
+    "exclusive empties the GPU": (
+        [has("a", 1), has("b", 1)], {"gib": 1, "exclusive": True}, {"a", "b"},
+    ),
+    "exclusive, in vain: one stays": (
+        [has("a", 1), has("busy", 1, priority=90, used=True)], {"gib": 1, "exclusive": True}, set(),
+    ),
+    "an exclusive holder has to go for anyone": (
+        [has("alone", 1, exclusive=True)], {"gib": 1}, {"alone"},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", VICTIMS)
+def test_who_is_asked(case: str) -> None:
     scene = Scene()
-    scene.hold("a", 3)
-    assert scene.want(5) == set()
-    assert scene.driver.state(scene.held["w"]) == "loading"
-
-
-def test_one_that_covers_is_better_than_two() -> None:
-    scene = Scene()
-    scene.hold("small", 1)
-    scene.hold("medium", 2)
-    scene.hold("large", 4)
-    assert scene.want(5) == {"large"}
-
-
-def test_of_equals_the_one_that_wastes_least_goes() -> None:
-    scene = Scene()
-    scene.hold("three", 3)
-    scene.hold("four", 4)
-    assert scene.want(4) == {"three"}
+    holders, wish, asked = VICTIMS[case]
+    for held in holders:
+        scene.hold(**{key: value for key, value in held.items() if key != "used"})
+        if held["used"]:
+            scene.use(held["name"])
+    assert scene.want(**wish) == asked
+    assert scene.driver.state(scene.held["w"]) == ("loading" if case == "it fits" else "queued")
+    if not asked:
+        scene.driver.advance(1.0)
+        assert scene.asked() == set()
 
 
 def test_of_the_same_size_the_least_recently_used_goes() -> None:
@@ -82,35 +118,6 @@ def test_of_the_same_size_the_least_recently_used_goes() -> None:
     assert scene.want(4) == {"new"}
 
 
-def test_lower_priority_goes_before_better_size() -> None:
-    scene = Scene()
-    scene.hold("exact", 3, priority=60)
-    scene.hold("cheap", 4, priority=40)
-    assert scene.want(4) == {"cheap"}
-
-
-def test_a_higher_class_is_touched_only_if_the_lower_one_is_not_enough() -> None:
-    scene = Scene()
-    scene.hold("low", 1, priority=10)
-    scene.hold("mid", 2, priority=20)
-    scene.hold("high", 4, priority=30)
-    assert scene.want(4) == {"low", "mid"}
-    scene = Scene()
-    scene.hold("low", 1, priority=10)
-    scene.hold("mid", 2, priority=20)
-    scene.hold("high", 4, priority=30)
-    assert scene.want(5) == {"high"}
-
-
-def test_idle_goes_before_in_use_even_if_more_have_to() -> None:
-    scene = Scene()
-    scene.hold("a", 2)
-    scene.hold("b", 2)
-    scene.hold("busy", 4)
-    scene.use("busy")
-    assert scene.want(4) == {"a", "b"}
-
-
 def test_in_use_is_asked_when_nothing_else_helps_and_only_as_few_as_needed() -> None:
     scene = Scene()
     scene.hold("a", 2)
@@ -119,22 +126,6 @@ def test_in_use_is_asked_when_nothing_else_helps_and_only_as_few_as_needed() -> 
     scene.use("busy1")
     scene.use("busy2")
     assert scene.want(5) == {"a", "busy2"} or scene.asked() == {"a", "busy1"}
-
-
-def test_pinned_is_never_asked_and_nothing_is_asked_in_vain() -> None:
-    scene = Scene()
-    scene.hold("a", 2)
-    waiter = scene.driver.consumer("early").acquire(6 * GIB + 1)
-    assert scene.asked() == {"a"}
-    scene.driver.consumer("x")
-    assert scene.driver.state(waiter) == "queued"
-    scene = Scene()
-    scene.hold("busy", 4, priority=90)
-    scene.use("busy")
-    scene.hold("idle", 2)
-    assert scene.want(5) == set(), "the idle one alone would not be enough"
-    scene.driver.advance(1.0)
-    assert scene.asked() == set()
 
 
 def test_a_holder_in_use_yields_only_to_its_priority_and_ageing_gets_there() -> None:
@@ -164,32 +155,6 @@ def test_a_residency_is_waited_for_rather_than_somebody_in_use_asked() -> None:
     assert scene.want(4) == set()
     scene.driver.advance(2.1)
     assert scene.asked() == {"fresh"}
-
-
-def test_a_fresh_one_that_would_not_help_is_not_waited_for() -> None:
-    scene = Scene()
-    scene.hold("busy", 5)
-    scene.use("busy")
-    scene.hold("fresh", 0.5, min_residency_s=2.0)
-    assert scene.want(4) == {"busy"}
-
-
-def test_exclusive_empties_the_gpu_and_waits_for_everyone() -> None:
-    scene = Scene()
-    scene.hold("a", 1)
-    scene.hold("b", 1)
-    assert scene.want(1, exclusive=True) == {"a", "b"}
-    scene = Scene()
-    scene.hold("a", 1)
-    scene.hold("busy", 1, priority=90)
-    scene.use("busy")
-    assert scene.want(1, exclusive=True) == set(), "one stays: the other would leave in vain"
-
-
-def test_an_exclusive_holder_has_to_go_for_anyone() -> None:
-    scene = Scene()
-    scene.hold("alone", 1, exclusive=True)
-    assert scene.want(1) == {"alone"}
 
 
 @pytest.mark.parametrize("count", [14, 20])

@@ -1,12 +1,12 @@
 """A head that waits for bytes nobody can be asked for (a stowaway's, a context's) holds back only
 those who would be in its way later."""
 
-import random
 from typing import Any
 
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
+from tests.support.scenes import give_back
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
@@ -69,10 +69,9 @@ def test_what_the_head_will_need_is_kept_for_it() -> None:
     driver.until(lambda: driver.state(head) == "loading", limit_s=1.0)
 
 
-def test_a_head_that_could_be_served_by_leaves_alone_keeps_its_room() -> None:
+def test_a_head_that_could_be_served_by_leaves_alone_keeps_its_room(driver: CoreDriver) -> None:
     """It fits beside the stowaway once the holder has gone: what comes back of the stowaway is not
     counted on."""
-    driver = CoreDriver(8 * GIB)
     busy, lease = held_after_peak(driver, "busy", 4, priority=90)
     busy.use_begin(lease)
     stowaway(driver, 2)
@@ -97,8 +96,7 @@ def test_one_that_can_never_be_asked_to_leave_does_not_pass() -> None:
     assert driver.state(other) == "held", "those behind it pass both"
 
 
-def test_nobody_passes_an_exclusive_head_that_waits_for_a_stowaway() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_nobody_passes_an_exclusive_head_that_waits_for_a_stowaway(driver: CoreDriver) -> None:
     stowaway(driver, 4)
     head = driver.consumer("head").acquire(5 * GIB, exclusive=True)
     small = driver.consumer("small").acquire(1 * GIB)
@@ -142,51 +140,11 @@ def test_the_ageing_bound_holds_against_those_who_passed() -> None:
     driver.until(lambda: driver.state(head) == "loading", limit_s=1.0)
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_whoever_passed_is_in_nobodys_way_when_the_stowaway_is_gone(seed: int) -> None:
-    draw = random.Random(seed)
-    driver = CoreDriver(8 * GIB)
-    keeper, kept = held_after_peak(driver, "keeper", 1, residue_bytes=draw.choice([0, 300 * MIB]))
-    if draw.random() < 0.5:
-        keeper.unload(kept)
-        driver.until(lambda: driver.state(kept) == "over")
-    stowaway(driver, draw.choice([2.5, 3, 4]))
-    head = driver.consumer("head").acquire(
-        int(draw.choice([5, 5.5, 6]) * GIB), priority=draw.choice([50, 60])
-    )
-    mine: dict[LeaseId, Consumer] = {}
-    for number in range(20):
-        person = driver.consumer(f"p{number}", priority=40)
-        mine[person.acquire(draw.choice([200 * MIB, GIB // 2, GIB, 2 * GIB]))] = person
-        driver.advance(0.3)
-        for lease, owner in mine.items():
-            if driver.state(lease) == "loading":
-                owner.load(lease)
-            elif driver.state(lease) == "held" and not driver.arbiter.inspect().leases[lease].uses:
-                owner.use_begin(lease)
-    asked = len(driver.notes("revoke_asked"))
-    stowaway(driver, 0)
-    driver.until(
-        lambda: driver.state(head) != "queued" or driver.state(kept) == "revoking", limit_s=2.0
-    )
-    if driver.state(kept) == "revoking":
-        keeper.unload(kept)
-        asked += 1
-    for lease, owner in mine.items():
-        if driver.state(lease) == "loading":
-            owner.load(lease)
-    driver.until(lambda: driver.state(head) == "loading", limit_s=2.0)
-    assert len(driver.notes("revoke_asked")) == asked, "of those who passed nobody is asked"
-    assert any(driver.state(lease) == "held" for lease in mine)
-
-
 # -- residues
-def test_small_ones_pass_a_head_that_waits_for_a_context() -> None:
+def test_small_ones_pass_a_head_that_waits_for_a_context(driver: CoreDriver) -> None:
     """7.4 GiB do not fit beside the context of a process that lives on; when it ends, both do."""
-    driver = CoreDriver(8 * GIB)
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
-    old.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, old, lease)
     head = driver.consumer("head").acquire(int(7.4 * GIB))
     too_big = driver.consumer("big").acquire(GIB)
     held_after_peak(driver, "small", 0.2)
@@ -195,12 +153,10 @@ def test_small_ones_pass_a_head_that_waits_for_a_context() -> None:
     driver.until(lambda: driver.state(head) == "loading", limit_s=2.0)
 
 
-def test_while_a_dead_process_s_context_is_measured_nobody_passes() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_while_a_dead_process_s_context_is_measured_nobody_passes(driver: CoreDriver) -> None:
     driver.device.lag_s = 1.0
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
-    old.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, old, lease)
     head = driver.consumer("head").acquire(int(7.4 * GIB))
     old.die()
     small = driver.consumer("small").acquire(200 * MIB)
@@ -215,21 +171,18 @@ def learned(driver: CoreDriver, gib: float) -> Consumer:
     lease = person.acquire(3 * GIB)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=3.0)
     person.load(lease, int(gib * GIB))
-    person.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, person, lease)
     person.die()
     driver.advance(3.0)
     return driver.consumer("greedy")
 
 
-def test_what_was_learned_never_waits_for_bytes_that_may_stay_for_good() -> None:
+def test_what_was_learned_never_waits_for_bytes_that_may_stay_for_good(driver: CoreDriver) -> None:
     """Regression: a request of 3 GiB of which 7.4 were learned waited for the context of a live
     process, and the request of that very process waited behind it: neither was ever granted."""
-    driver = CoreDriver(8 * GIB)
     greedy = learned(driver, 7.4)
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
-    old.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, old, lease)
     head, behind = greedy.acquire(3 * GIB), old.acquire(2 * GIB)
     driver.until(lambda: driver.state(head) == "loading", limit_s=2.0)
     charged = driver.gpu()["charged_bytes"]
@@ -238,9 +191,8 @@ def test_what_was_learned_never_waits_for_bytes_that_may_stay_for_good() -> None
     driver.until(lambda: driver.state(behind) == "loading", limit_s=2.0)
 
 
-def test_what_holders_will_give_back_is_waited_for_at_the_learned_bytes() -> None:
+def test_what_holders_will_give_back_is_waited_for_at_the_learned_bytes(driver: CoreDriver) -> None:
     """A pinned holder ends one day: until then the request keeps what was learned of it."""
-    driver = CoreDriver(8 * GIB)
     greedy = learned(driver, 6)
     old, lease = held_after_peak(driver, "old", 4, evictable=False)
     head = greedy.acquire(3 * GIB)
@@ -251,12 +203,10 @@ def test_what_holders_will_give_back_is_waited_for_at_the_learned_bytes() -> Non
     assert driver.gpu()["charged_bytes"] == 6 * GIB
 
 
-def test_nothing_is_settled_below_the_declaration() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_nothing_is_settled_below_the_declaration(driver: CoreDriver) -> None:
     greedy = learned(driver, 7.4)
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
-    old.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, old, lease)
     head = greedy.acquire(int(7.3 * GIB))
     driver.advance(2.0)
     assert (driver.state(head), driver.view(head)["charge_bytes"]) == ("queued", int(7.4 * GIB))
@@ -265,10 +215,9 @@ def test_nothing_is_settled_below_the_declaration() -> None:
 
 
 # -- whose bytes
-def test_bytes_that_the_head_s_own_process_holds_already_do_not_leave() -> None:
+def test_bytes_that_the_head_s_own_process_holds_already_do_not_leave(driver: CoreDriver) -> None:
     """It loaded 3 GiB before it asked: they are a part of its 6. Only the other one's bytes are
     counted on."""
-    driver = CoreDriver(8 * GIB)
     eager = driver.consumer("eager")
     eager.hold(3 * GIB)
     stowaway(driver, 2)
@@ -342,8 +291,7 @@ def test_those_who_passed_are_no_room_for_the_next_to_pass() -> None:
     assert {note["lease_id"] for note in driver.notes("revoke_asked")} == {lease}
 
 
-def test_one_that_was_there_before_the_head_did_not_pass_it() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_one_that_was_there_before_the_head_did_not_pass_it(driver: CoreDriver) -> None:
     _, low = held_after_peak(driver, "low", 2, priority=10, min_residency_s=10.0)
     driver.advance(0.1)
     head = driver.consumer("head").acquire(6 * GIB)

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.scenes import held, sent_away
+from tests.support.scenes import give_back, held, in_use, revoked, sent_away, shown
 from vram_arbiter.arbiter.core.events import ProcessDied
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
@@ -16,8 +16,7 @@ MIB = d.MIB
 
 
 # -- there and back
-def test_the_detector_returns_by_itself_after_the_grab() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_the_detector_returns_by_itself_after_the_grab(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver)
     before = det.token(lease)
     policy.use_begin(wanted, "grab")
@@ -30,22 +29,20 @@ def test_the_detector_returns_by_itself_after_the_grab() -> None:
     assert granted["lease"]["lease_id"] == lease
     assert det.token(lease) > before, "a fresh token"
     det.load(lease)
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert (view["state"], view["standby"], view["charge_bytes"]) == ("held", True, 5 * GIB)
     assert driver.notes("granted")[-1]["by_itself"] is True
     assert driver.notes("switch")[-1]["switched"] is False
 
 
-def test_what_standby_looks_like() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_what_standby_looks_like(driver: CoreDriver) -> None:
     det, lease, _, _ = sent_away(driver)
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert (view["gpu"], view["charge_bytes"], view["uses"]) == (None, 0, 0)
     assert "ttl_left_s" not in view
     assert "position" not in view
     assert driver.notes("standby")[-1]["left_for"] == "policy"
+    assert driver.arbiter.inspect().leases[lease].story[-1][2] == "verified"
     driver.advance(600.0)
     assert driver.state(lease) == "standby", "nobody has to renew it"
     assert answer(det.renew((lease, det.token(lease))))["alive"] == [lease]
@@ -65,13 +62,10 @@ def test_it_never_comes_back_beside_the_one_that_it_left_for() -> None:
     driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
 
 
-def test_cancel_on_the_way_to_standby_is_heard() -> None:
+def test_cancel_on_the_way_to_standby_is_heard(driver: CoreDriver) -> None:
     """Regression: it was refused while the bytes were measured, and the lease came back to a holder
     that did not want it."""
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5, standby=True)
-    driver.consumer("policy").acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, _, _ = revoked(driver)
     driver.device.lag_s = 0.5
     det.unload(lease)
     assert driver.state(lease) == "verifying"
@@ -79,8 +73,7 @@ def test_cancel_on_the_way_to_standby_is_heard() -> None:
     driver.until(lambda: driver.state(lease) == "over", limit_s=5.0)
 
 
-def test_it_asks_nobody_to_leave() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_it_asks_nobody_to_leave(driver: CoreDriver) -> None:
     _, lease, policy, wanted = sent_away(driver)
     vlm = driver.consumer("vlm")
     vlm_lease = vlm.acquire(4 * GIB)
@@ -96,11 +89,9 @@ def test_it_asks_nobody_to_leave() -> None:
     assert (why["state"], why["back"]) == ("standby", "no_room")
 
 
-def test_it_never_delays_a_waiter() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_it_never_delays_a_waiter(driver: CoreDriver) -> None:
     _, lease, policy, wanted = sent_away(driver)
-    busy, small = held(driver, "busy", 1)
-    busy.use_begin(small)
+    in_use(driver, "busy", 1)
     policy.use_begin(wanted)
     big = driver.consumer("big").acquire(7 * GIB)
     policy.use_end(wanted)
@@ -112,9 +103,8 @@ def test_it_never_delays_a_waiter() -> None:
     assert (why["state"], why["back"], why["ahead"]) == ("standby", "behind", "big")
 
 
-def test_it_waits_until_the_gpu_has_been_quiet() -> None:
+def test_it_waits_until_the_gpu_has_been_quiet(driver: CoreDriver) -> None:
     """Between two goals the policy is away for a moment only."""
-    driver = CoreDriver(8 * GIB)
     _, lease, policy, wanted = sent_away(driver, min_residency_s=2.0)
     policy.unload(wanted)
     driver.advance(1.0)
@@ -130,8 +120,14 @@ def test_it_waits_until_the_gpu_has_been_quiet() -> None:
     driver.until(lambda: driver.state(lease) == "loading", limit_s=0.2)
 
 
-def test_who_came_back_unasked_has_no_claim_to_stay() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_the_end_of_the_quiet_needs_no_reading_to_be_noticed() -> None:
+    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
+    _, lease, policy, wanted = sent_away(driver, min_residency_s=20.0)
+    policy.unload(wanted)
+    driver.until(lambda: driver.state(lease) == "loading", limit_s=20.1)
+
+
+def test_who_came_back_unasked_has_no_claim_to_stay(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver, min_residency_s=2.0)
     policy.unload(wanted)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=3.0)
@@ -141,8 +137,7 @@ def test_who_came_back_unasked_has_no_claim_to_stay() -> None:
     assert driver.state(lease) == "revoking", "its minimum residency counts from its first use"
 
 
-def test_once_used_it_has_its_residency() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_once_used_it_has_its_residency(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver, min_residency_s=2.0)
     policy.unload(wanted)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=3.0)
@@ -171,8 +166,7 @@ def all_away(
         person.unload(lease)
         driver.advance(0.2)
     boss.load(all_of_it)
-    boss.unload(all_of_it)
-    driver.until(lambda: driver.state(all_of_it) == "over")
+    give_back(driver, boss, all_of_it)
     return people
 
 
@@ -181,8 +175,7 @@ def stay(driver: CoreDriver, gib: float) -> tuple[Consumer, LeaseId]:
     return held(driver, "stays", gib, evictable=False)
 
 
-def test_the_order_is_priority_then_who_left_first() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_the_order_is_priority_then_who_left_first(driver: CoreDriver) -> None:
     people = all_away(driver, 7, second=(2, {}), first=(2, {}), third=(2, {"priority": 60}))
     back = []
     for _ in people:
@@ -194,8 +187,7 @@ def test_the_order_is_priority_then_who_left_first() -> None:
     assert back == ["third", "second", "first"]
 
 
-def test_a_small_one_does_not_take_the_place_of_the_one_before_it() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_small_one_does_not_take_the_place_of_the_one_before_it(driver: CoreDriver) -> None:
     people = all_away(driver, 7, det=(5.2, {}), tiny=(2.4, {}))
     driver.device.set(ProcessKey(9, 9), 1 * GIB, driver.now)
     other, resident = stay(driver, 2)
@@ -208,8 +200,7 @@ def test_a_small_one_does_not_take_the_place_of_the_one_before_it() -> None:
     driver.until(lambda: driver.state(people["det"][1]) == "loading", limit_s=2.0)
 
 
-def test_a_small_one_does_not_pass_an_exclusive_one() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_small_one_does_not_pass_an_exclusive_one(driver: CoreDriver) -> None:
     people = all_away(driver, 7, det=(5, {"priority": 60}), tiny=(1, {}))
     det, alone = people["det"]
     det.try_acquire(5 * GIB, exclusive=True, standby=True, min_residency_s=1.0, priority=60)
@@ -229,8 +220,7 @@ def test_a_small_one_does_not_pass_an_exclusive_one() -> None:
     ]
 
 
-def test_several_that_do_not_fit_keep_their_turns() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_several_that_do_not_fit_keep_their_turns(driver: CoreDriver) -> None:
     people = all_away(driver, 7.5, det=(4, {}), vlm=(3, {}), tiny=(0.5, {}))
     other, resident = stay(driver, 6)
     driver.until(lambda: driver.state(people["tiny"][1]) == "loading", limit_s=3.0)
@@ -240,27 +230,21 @@ def test_several_that_do_not_fit_keep_their_turns() -> None:
     driver.until(lambda: driver.state(people["det"][1]) == "loading", limit_s=3.0)
 
 
-def test_who_leaves_unasked_does_not_want_back() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_who_leaves_unasked_does_not_want_back(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, standby=True)
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, det, lease)
     assert driver.journal == {}
 
 
-def test_who_exits_does_not_come_back() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5, standby=True)
-    driver.consumer("policy").acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+def test_who_exits_does_not_come_back(driver: CoreDriver) -> None:
+    det, lease, _, _ = revoked(driver)
     det.hold(0)
     det.release(lease, exiting=True)
     driver.until(lambda: driver.state(lease) == "over")
     assert f"lease:{lease}" not in driver.journal
 
 
-def test_pressure_sends_on_standby_too_and_lets_back_when_it_is_over() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_pressure_sends_on_standby_too_and_lets_back_when_it_is_over(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, standby=True)
     game = driver.consumer("game")
     driver.device.set(game.process, 4 * GIB, driver.now)
@@ -273,8 +257,7 @@ def test_pressure_sends_on_standby_too_and_lets_back_when_it_is_over() -> None:
     driver.until(lambda: driver.state(lease) == "loading", limit_s=5.0)
 
 
-def test_a_blocked_gpu_brings_nobody_back() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_blocked_gpu_brings_nobody_back(driver: CoreDriver) -> None:
     _, lease, policy, wanted = sent_away(driver)
     policy.unload(wanted)
     driver.device.failing = "NVML_ERROR_UNKNOWN"
@@ -286,8 +269,7 @@ def test_a_blocked_gpu_brings_nobody_back() -> None:
     driver.until(lambda: driver.state(lease) == "loading", limit_s=5.0)
 
 
-def test_the_reading_has_to_agree_before_it_comes_back() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_the_reading_has_to_agree_before_it_comes_back(driver: CoreDriver) -> None:
     driver.device.lag_s = 1.0
     _, lease, policy, wanted = sent_away(driver)
     policy.unload(wanted)
@@ -296,8 +278,7 @@ def test_the_reading_has_to_agree_before_it_comes_back() -> None:
 
 
 # -- wanted now
-def test_reacquire_makes_it_a_waiter_that_makes_others_leave() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_reacquire_makes_it_a_waiter_that_makes_others_leave(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver)
     told = answer(det.reacquire(lease))
     assert (told["state"], told["lease"]["position"]) == ("queued", 1)
@@ -309,8 +290,7 @@ def test_reacquire_makes_it_a_waiter_that_makes_others_leave() -> None:
     assert driver.notes("switch")[-1]["evicted"][0]["consumer"] == "policy"
 
 
-def test_reacquire_with_room_is_answered_at_once() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_reacquire_with_room_is_answered_at_once(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver, min_residency_s=20.0)
     policy.unload(wanted)
     driver.advance(1.0)
@@ -321,8 +301,7 @@ def test_reacquire_with_room_is_answered_at_once() -> None:
     assert refusal(det.reacquire(lease)).code == "bad_state"
 
 
-def test_a_late_repeat_of_reacquire_asks_for_nothing() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_late_repeat_of_reacquire_asks_for_nothing(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver)
     old = det.token(lease)
     det.reacquire(lease)
@@ -336,12 +315,8 @@ def test_a_late_repeat_of_reacquire_asks_for_nothing() -> None:
     assert refusal(thief.reacquire(lease)).code == "not_permitted"
 
 
-def test_reacquire_on_the_way_out_waits_for_the_verdict() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5, standby=True)
-    policy = driver.consumer("policy")
-    wanted = policy.acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+def test_reacquire_on_the_way_out_waits_for_the_verdict(driver: CoreDriver) -> None:
+    det, lease, _, wanted = revoked(driver)
     assert refusal(det.reacquire(lease)).code == "bad_state", "it has not let go"
     det.unload(lease)
     assert answer(det.reacquire(lease, wait_timeout_s=30.0))["state"] == "queued"
@@ -354,20 +329,15 @@ def test_reacquire_on_the_way_out_waits_for_the_verdict() -> None:
     assert f"lease:{lease}" not in driver.journal
 
 
-def test_reacquire_of_what_is_not_coming_back_is_refused() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_reacquire_of_what_is_not_coming_back_is_refused(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     det.unload(lease)
     assert refusal(det.reacquire(lease)).code == "bad_state"
 
 
-def test_reacquire_that_can_never_fit_changes_nothing() -> None:
+def test_reacquire_that_can_never_fit_changes_nothing(driver: CoreDriver) -> None:
     """It was granted once; after a restart there is a smaller GPU."""
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5, standby=True)
-    policy = driver.consumer("policy")
-    wanted = policy.acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, policy, wanted = revoked(driver)
     det.unload(lease)
     driver.until(lambda: driver.state(wanted) == "loading")
     token = det.token(lease)
@@ -389,8 +359,7 @@ def test_a_full_queue_refuses_reacquire_too() -> None:
     assert driver.state(lease) == "standby"
 
 
-def test_a_new_acquire_of_the_same_model_takes_the_lease_over() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_new_acquire_of_the_same_model_takes_the_lease_over(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver)
     told = answer(det.try_acquire(4 * GIB, nonce="again", standby=True, priority=70))
     assert (told["state"], told["lease"]["lease_id"], told["lease"]["priority"]) == (
@@ -401,8 +370,7 @@ def test_a_new_acquire_of_the_same_model_takes_the_lease_over() -> None:
     assert answer(det.try_acquire(4 * GIB, nonce="again"))["lease"]["lease_id"] == lease, "a repeat"
     policy.unload(wanted)
     driver.until(lambda: driver.state(lease) == "loading")
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert view["charge_bytes"] == 4 * GIB, "as it is asked for now"
     other = answer(det.try_acquire(1 * GIB, key="another"))
     assert other["lease"]["lease_id"] != lease
@@ -426,8 +394,7 @@ def test_a_lease_that_was_taken_over_comes_back_as_it_was_asked_for_last() -> No
     det.reacquire(lease)
     policy.unload(wanted)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=2.0)
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert view["charge_bytes"] == 6 * GIB
 
 

@@ -6,19 +6,14 @@ from collections.abc import Callable
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.engine_state import state_of
-from tests.support.scenes import held, order, sent_away
-from vram_arbiter.arbiter.core import invariants
-from vram_arbiter.arbiter.core.invariants import InvariantViolation
-from vram_arbiter.arbiter.core.model.lease import LeaseState
+from tests.support.scenes import give_back, held, order, revoked, sent_away
 from vram_arbiter.schemas import defaults as d
 
 GIB = d.GIB
 
 
 # -- ends
-def test_giving_up_a_lease_on_standby() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_giving_up_a_lease_on_standby(driver: CoreDriver) -> None:
     det, lease, _, _ = sent_away(driver)
     assert answer(det.cancel(lease)) == {"state": "cancelled"}
     assert answer(det.cancel(lease)) == {"state": "cancelled"}, "a repeat"
@@ -26,15 +21,13 @@ def test_giving_up_a_lease_on_standby() -> None:
     assert f"lease:{lease}" not in driver.journal
 
 
-def test_a_repeat_of_the_release_does_not_end_it() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_repeat_of_the_release_does_not_end_it(driver: CoreDriver) -> None:
     det, lease, _, _ = sent_away(driver)
     assert answer(det.release(lease))["state"] == "standby"
     assert driver.state(lease) == "standby"
 
 
-def test_requests_that_make_no_sense_away_are_refused() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_requests_that_make_no_sense_away_are_refused(driver: CoreDriver) -> None:
     det, lease, _, _ = sent_away(driver)
     assert refusal(det.ready(lease)).code == "bad_state"
     assert refusal(det.use_begin(lease)).code == "bad_state"
@@ -44,8 +37,7 @@ def test_requests_that_make_no_sense_away_are_refused() -> None:
 
 
 @pytest.mark.parametrize("reason", ["bye", "silent while connections were needed"])
-def test_it_ends_with_its_connection(reason: str) -> None:
-    driver = CoreDriver(8 * GIB)
+def test_it_ends_with_its_connection(driver: CoreDriver, reason: str) -> None:
     det, lease, _, _ = sent_away(driver)
     det.leave(reason)
     assert driver.state(lease) == "over"
@@ -54,21 +46,17 @@ def test_it_ends_with_its_connection(reason: str) -> None:
 
 @pytest.mark.parametrize("end", [Consumer.leave, Consumer.die], ids=["connection", "process"])
 def test_who_ends_during_the_measurement_does_not_want_it_back(
+    driver: CoreDriver,
     end: Callable[[Consumer], object],
 ) -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5, standby=True)
-    policy = driver.consumer("policy")
-    wanted = policy.acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, _, wanted = revoked(driver)
     det.unload(lease)
     end(det)
     driver.until(lambda: driver.state(wanted) == "loading")
     assert driver.state(lease) == "over"
 
 
-def test_it_ends_with_its_process() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_it_ends_with_its_process(driver: CoreDriver) -> None:
     det, lease, _, _ = sent_away(driver)
     det.die()
     assert driver.state(lease) == "over"
@@ -76,12 +64,10 @@ def test_it_ends_with_its_process() -> None:
 
 
 # -- operators
-def test_whom_an_operator_evicts_does_not_come_back() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_whom_an_operator_evicts_does_not_come_back(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, standby=True)
     order(driver, "evict", lease)
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, det, lease)
     assert driver.journal == {}
 
 
@@ -90,10 +76,7 @@ def test_an_operators_word_outweighs_the_engines() -> None:
     for steps in range(3):
         driver = CoreDriver(8 * GIB)
         driver.device.lag_s = 0.3
-        det, lease = held(driver, "det", 5, standby=True)
-        policy = driver.consumer("policy")
-        wanted = policy.acquire(5 * GIB)
-        driver.until(lambda: driver.state(lease) == "revoking")  # noqa: B023  # reason: run at once
+        det, lease, _, wanted = revoked(driver)
         if steps > 0:
             det.unload(lease)
         if steps > 1:
@@ -107,8 +90,7 @@ def test_an_operators_word_outweighs_the_engines() -> None:
     assert driver.pushes("lost", lease)[-1]["error"]["code"] == "lease_lost"
 
 
-def test_evicting_one_that_leaves_by_itself_is_fine() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_evicting_one_that_leaves_by_itself_is_fine(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, standby=True)
     det.unload(lease)
     order(driver, "evict", lease)
@@ -116,21 +98,18 @@ def test_evicting_one_that_leaves_by_itself_is_fine() -> None:
     assert f"lease:{lease}" not in driver.journal
 
 
-def test_an_operators_eviction_outlives_a_restart() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_an_operators_eviction_outlives_a_restart(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, standby=True)
     token = det.token(lease)
     order(driver, "evict", lease)
     driver.restart()
     det.connect()
     det.reattach(lease, token)
-    det.unload(lease)
-    driver.until(lambda: driver.state(lease) == "over")
+    give_back(driver, det, lease)
     assert f"lease:{lease}" not in driver.journal
 
 
-def test_what_an_operator_evicted_and_its_holder_thinks_away_is_over() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_what_an_operator_evicted_and_its_holder_thinks_away_is_over(driver: CoreDriver) -> None:
     other, resident = held(driver, "other", 1)
     det, lease = held(driver, "det", 5, standby=True)
     token, other_token = det.token(lease), other.token(resident)
@@ -145,8 +124,7 @@ def test_what_an_operator_evicted_and_its_holder_thinks_away_is_over() -> None:
     assert f"lease:{lease}" not in driver.journal
 
 
-def test_a_pin_on_standby_holds_after_the_return() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_pin_on_standby_holds_after_the_return(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver)
     order(driver, "pin", lease)
     assert driver.journal[f"lease:{lease}"]["pinned"] == ["ops", "test"]
@@ -159,33 +137,3 @@ def test_a_pin_on_standby_holds_after_the_return() -> None:
 
 
 # -- several GPUs, invariants
-def test_it_may_come_back_on_another_gpu() -> None:
-    driver = CoreDriver(8 * GIB, gpus=2)
-    det, lease = held(driver, "det", 5, standby=True)
-    other, second = held(driver, "other", 5)
-    policy = driver.consumer("policy")
-    wanted = policy.acquire(5 * GIB, gpu="0")
-    driver.until(lambda: driver.state(lease) == "revoking")
-    det.unload(lease)
-    driver.until(lambda: driver.state(wanted) == "loading")
-    policy.load(wanted)
-    other.unload(second)
-    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
-    view = driver.view(lease)
-    assert view is not None
-    assert view["gpu"] == "GPU-1", "beside nobody that it left for"
-
-
-def test_invariants_of_what_is_away() -> None:
-    driver = CoreDriver(8 * GIB)
-    _, lease, _, _ = sent_away(driver)
-    core = state_of(driver.arbiter)
-    core.turn.granted.clear()
-    one = core.leases[lease]
-    one.state = LeaseState.HELD
-    with pytest.raises(InvariantViolation, match="counts as away"):
-        invariants.check(core)
-    one.state = LeaseState.STANDBY
-    one.gpu = next(iter(core.gpus))
-    with pytest.raises(InvariantViolation, match="it has a GPU"):
-        invariants.check(core)

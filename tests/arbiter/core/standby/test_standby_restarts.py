@@ -1,7 +1,7 @@
 """A restart of the daemon loses no lease on standby, at whichever step of its way it comes."""
 
 from tests.support.core_driver import CoreDriver, answer, refusal
-from tests.support.scenes import held, sent_away
+from tests.support.scenes import held, revoked, sent_away, shown
 from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.arbiter.core.events import ClientConnected, Recovered
 from vram_arbiter.arbiter.host.records import records_of
@@ -12,8 +12,7 @@ from vram_arbiter.schemas.wire.pushes import GrantedPush
 GIB = d.GIB
 
 
-def test_a_restart_keeps_it_and_waits_for_its_holder() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_restart_keeps_it_and_waits_for_its_holder(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver, ttl_s=10.0)
     token, policy_token = det.token(lease), policy.token(wanted)
     driver.restart()
@@ -32,8 +31,7 @@ def test_a_restart_keeps_it_and_waits_for_its_holder() -> None:
     driver.advance(60.0)
 
 
-def test_a_holder_that_does_not_come_back_loses_it() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_holder_that_does_not_come_back_loses_it(driver: CoreDriver) -> None:
     _, lease, policy, wanted = sent_away(driver, ttl_s=10.0)
     policy_token = policy.token(wanted)
     driver.restart()
@@ -46,10 +44,9 @@ def test_a_holder_that_does_not_come_back_loses_it() -> None:
     assert f"lease:{lease}" not in driver.journal
 
 
-def test_who_asks_for_it_anew_before_re_attaching_has_come_back() -> None:
+def test_who_asks_for_it_anew_before_re_attaching_has_come_back(driver: CoreDriver) -> None:
     """After a restart it asks for the model again, and waits for longer than a holder has time to
     come back."""
-    driver = CoreDriver(8 * GIB)
     det, lease, policy, wanted = sent_away(driver, ttl_s=10.0)
     policy_token = policy.token(wanted)
     driver.restart()
@@ -67,8 +64,7 @@ def test_who_asks_for_it_anew_before_re_attaching_has_come_back() -> None:
     driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
 
 
-def test_only_leases_on_standby_in_the_journal_hold_up_nobody() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_only_leases_on_standby_in_the_journal_hold_up_nobody(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver)
     policy.unload(wanted)
     driver.advance(0.0)
@@ -82,13 +78,9 @@ def test_only_leases_on_standby_in_the_journal_hold_up_nobody() -> None:
     assert token == Token(1, 2)
 
 
-def test_a_restart_in_the_middle_of_the_way_out_does_not_make_it_a_wish() -> None:
+def test_a_restart_in_the_middle_of_the_way_out_does_not_make_it_a_wish(driver: CoreDriver) -> None:
     """The holder was asked before the restart and lets go after it: it still comes back."""
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5, standby=True)
-    policy = driver.consumer("policy")
-    policy.acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, policy, wanted = revoked(driver)
     token = det.token(lease)
     driver.restart()
     assert driver.state(lease) == "held", (
@@ -103,10 +95,9 @@ def test_a_restart_in_the_middle_of_the_way_out_does_not_make_it_a_wish() -> Non
     assert driver.state(lease) == "standby"
 
 
-def test_a_restart_does_not_let_a_revoke_outrun_the_uses_of_others() -> None:
+def test_a_restart_does_not_let_a_revoke_outrun_the_uses_of_others(driver: CoreDriver) -> None:
     """Regression: a lease restored as asked to leave refused the runner's goal, and unloaded in the
     middle of the grab."""
-    driver = CoreDriver(8 * GIB)
     policy, lease = held(driver, "policy", 5, standby=True)
     runner = driver.consumer("runner")
     token = policy.token(lease)
@@ -125,12 +116,9 @@ def test_a_restart_does_not_let_a_revoke_outrun_the_uses_of_others() -> None:
     driver.until(lambda: bool(driver.notes("standby")))
 
 
-def test_a_restart_during_the_measurement() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_restart_during_the_measurement(driver: CoreDriver) -> None:
     driver.device.lag_s = 0.5
-    det, lease = held(driver, "det", 5, standby=True)
-    driver.consumer("policy").acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, _, _ = revoked(driver)
     token = det.token(lease)
     det.unload(lease)
     driver.restart()
@@ -141,12 +129,9 @@ def test_a_restart_during_the_measurement() -> None:
     assert driver.notes("standby")[-1]["left_for"] == "policy"
 
 
-def test_a_release_that_was_lost_is_made_up_for() -> None:
+def test_a_release_that_was_lost_is_made_up_for(driver: CoreDriver) -> None:
     """The daemon died with the release in its socket: the holder says that it let go."""
-    driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5, standby=True)
-    driver.consumer("policy").acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, _, _ = revoked(driver)
     token = det.token(lease)
     other, resident = held(driver, "other", 1)
     driver.advance(0.01)
@@ -164,9 +149,7 @@ def test_a_release_that_was_lost_is_made_up_for() -> None:
 
 def test_after_a_restart_its_holder_says_that_it_left_and_not_an_empty_gpu() -> None:
     driver = CoreDriver(8 * GIB)
-    det, lease = held(driver, "det", 5, standby=True)
-    driver.consumer("policy").acquire(5 * GIB)
-    driver.until(lambda: driver.state(lease) == "revoking")
+    det, lease, _, _ = revoked(driver)
     token = det.token(lease)
     det.hold(0)
     driver.restart()
@@ -178,8 +161,7 @@ def test_after_a_restart_its_holder_says_that_it_left_and_not_an_empty_gpu() -> 
     assert len(driver.notes("standby")) == 1
 
 
-def test_a_grant_that_its_holder_missed_is_said_again() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_grant_that_its_holder_missed_is_said_again(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver)
     token = det.token(lease)
     policy.unload(wanted)
@@ -200,8 +182,7 @@ def test_a_grant_that_its_holder_missed_is_said_again() -> None:
     det.load(lease)
 
 
-def test_one_that_is_queued_again_re_attaches_as_it_is() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_one_that_is_queued_again_re_attaches_as_it_is(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver)
     policy.use_begin(wanted)
     det.reacquire(lease)
@@ -209,8 +190,7 @@ def test_one_that_is_queued_again_re_attaches_as_it_is() -> None:
     assert kept["lease"]["state"] == "queued"
 
 
-def test_a_lost_journal_does_not_lose_it_either() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_lost_journal_does_not_lose_it_either(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver)
     token, policy_token = det.token(lease), policy.token(wanted)
     driver.restart(keep_journal=False)
@@ -218,7 +198,7 @@ def test_a_lost_journal_does_not_lose_it_either() -> None:
     policy.connect()
     policy.reattach(wanted, policy_token)
     (kept,) = answer(det.reattach(lease, token, away=True))["leases"]
-    assert kept["lease"]["state"] == "standby"
+    assert (kept["lease"]["state"], "parked_bytes" in kept["lease"]) == ("standby", False)
     assert driver.journal[f"lease:{lease}"]["state"] == "standby"
     assert driver.gpu()["charged_bytes"] == 5 * GIB
     policy.unload(wanted)
@@ -226,18 +206,14 @@ def test_a_lost_journal_does_not_lose_it_either() -> None:
     assert driver.state(lease) == "loading"
 
 
-def test_a_held_lease_that_the_journal_lost_still_goes_on_standby() -> None:
+def test_a_held_lease_that_the_journal_lost_still_goes_on_standby(driver: CoreDriver) -> None:
     """The feature watches what a holder brings back, not only what it saw asked for."""
-    driver = CoreDriver(8 * GIB)
-    det = driver.consumer("det")
-    lease = det.acquire(5 * GIB, standby=True)
-    det.load(lease)
+    det, lease = held(driver, "det", 5, standby=True)
     token = det.token(lease)
     driver.restart(keep_journal=False)
     det.connect()
     det.reattach(lease, token)
-    view = driver.view(lease)
-    assert view is not None
+    view = shown(driver, lease)
     assert view["standby"] is True
     driver.advance(20.0)  # holders that the lost journal did not name had their time
     policy = driver.consumer("policy")
@@ -248,8 +224,7 @@ def test_a_held_lease_that_the_journal_lost_still_goes_on_standby() -> None:
     driver.until(lambda: driver.state(wanted) == "loading")
 
 
-def test_a_return_that_cannot_be_journalled_is_not_made() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_return_that_cannot_be_journalled_is_not_made(driver: CoreDriver) -> None:
     _, lease, policy, wanted = sent_away(driver, min_residency_s=1.0)
     policy.unload(wanted)
     driver.advance(0.5)

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import CoreDriver
+from tests.support.scenes import held
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ProcessKey
@@ -33,10 +34,10 @@ LIES: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("lie", LIES)
 def test_nothing_is_granted_on_an_impossible_reading_until_a_plausible_one(
+    driver: CoreDriver,
     lie: dict[str, Any],
 ) -> None:
     """Regression: a changed capacity, -1 or 2^60 bytes used were believed."""
-    driver = CoreDriver(8 * GIB)
     driver.device.lies = lie
     driver.advance(3.0)
     waiter = driver.consumer("waiter").acquire(GIB)
@@ -63,11 +64,8 @@ def test_a_first_reading_that_cannot_be_true_is_no_measure_for_later_ones() -> N
     assert driver.gpu()["blocked"] is None
 
 
-def test_bytes_are_not_measured_gone_by_an_impossible_reading() -> None:
-    driver = CoreDriver(8 * GIB)
-    det = driver.consumer("det")
-    lease = det.acquire(5 * GIB)
-    det.load(lease)
+def test_bytes_are_not_measured_gone_by_an_impossible_reading(driver: CoreDriver) -> None:
+    det, _ = held(driver, "det", 5)
     driver.device.lies = {"used_bytes": -(1 << 40), "processes": ()}
     det.die()
     driver.advance(2.0)
@@ -79,17 +77,14 @@ def test_bytes_are_not_measured_gone_by_an_impossible_reading() -> None:
 
 def test_an_empty_gpu_that_cannot_be_true_accounts_for_no_holder_after_a_restart() -> None:
     driver = CoreDriver(8 * GIB)
-    det = driver.consumer("det")
-    lease = det.acquire(5 * GIB)
-    det.load(lease)
+    held(driver, "det", 5)
     driver.device.lies = {"used_bytes": -1}
     driver.restart()
     driver.advance(2.0)
     assert driver.status()["phase"] == "recovering"
 
 
-def test_a_little_more_than_everything_is_the_drivers_rounding() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_little_more_than_everything_is_the_drivers_rounding(driver: CoreDriver) -> None:
     driver.device.lies = {"used_bytes": 8 * GIB + d.MIB, "total_bytes": 8 * GIB - d.MIB}
     driver.advance(2.0)
     assert driver.gpu()["measured_used_bytes"] == 8 * GIB + d.MIB

@@ -3,6 +3,7 @@
 import pytest
 
 from tests.support.core_driver import CoreDriver
+from tests.support.scenes import held
 from vram_arbiter.arbiter.core.events import ProcessDied
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ProcessKey
@@ -18,9 +19,7 @@ def test_the_verdict_does_not_depend_on_what_is_seen_first(read_first: bool) -> 
     nothing was granted on them; only the note was wrong."""
     driver = CoreDriver()
     driver.device.names[CHILD] = "job"
-    parent = driver.consumer("job")
-    lease = parent.acquire(4 * GIB)
-    parent.load(lease)
+    parent, _ = held(driver, "job", 4)
     driver.advance(2.0)
     driver.device.set(parent.process, 0, driver.now)
     driver.device.set(CHILD, 4 * GIB, driver.now)
@@ -44,13 +43,10 @@ def test_the_verdict_does_not_depend_on_what_is_seen_first(read_first: bool) -> 
     driver.until(lambda: driver.state(wanted) == "loading")
 
 
-def test_bytes_that_were_given_back_long_ago_are_not_looked_for() -> None:
+def test_bytes_that_were_given_back_long_ago_are_not_looked_for(driver: CoreDriver) -> None:
     """A holder that freed its memory and dies later owes nothing: a program that took the room
     since is a stowaway, and no culprit."""
-    driver = CoreDriver()
-    holder = driver.consumer("holder")
-    lease = holder.acquire(4 * GIB)
-    holder.load(lease)
+    holder, _ = held(driver, "holder", 4)
     driver.advance(2.0)
     driver.device.set(holder.process, 0, driver.now)
     driver.advance(30.0)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
-from tests.support.scenes import held, hidden_gpu
+from tests.support.scenes import give_back, held, hidden_gpu
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
@@ -23,11 +23,11 @@ def verdicts(driver: CoreDriver) -> list[tuple[str, bool]]:
 
 @pytest.mark.parametrize("since", ["always", "late"])
 def test_a_living_holder_that_nobody_lists_is_charged_for_what_it_did_not_give_back(
+    driver: CoreDriver,
     since: str,
 ) -> None:
     """Regression: a process that the list omits counted as one without bytes, and its memory was
     granted again after ten seconds."""
-    driver = CoreDriver(8 * GIB)
     if since == "always":
         driver.device.unlisted.add(ProcessKey(101, 707))
     det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
@@ -52,8 +52,7 @@ def test_a_living_holder_that_nobody_lists_is_charged_for_what_it_did_not_give_b
     )
 
 
-def test_its_death_frees_what_it_kept() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_its_death_frees_what_it_kept(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("w").acquire(6 * GIB, exclusive=True)
     driver.device.unlisted.add(det.process)
@@ -66,8 +65,7 @@ def test_its_death_frees_what_it_kept() -> None:
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=0.1)
 
 
-def test_what_it_gave_back_and_somebody_else_took_is_that_ones() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_what_it_gave_back_and_somebody_else_took_is_that_ones(driver: CoreDriver) -> None:
     driver.device.unlisted.add(ProcessKey(101, 707))
     det, lease = held(driver, "det", 5)
     det.unloading(lease)
@@ -80,8 +78,7 @@ def test_what_it_gave_back_and_somebody_else_took_is_that_ones() -> None:
     assert (driver.gpu()["charged_bytes"], driver.gpu()["stowaway_bytes"]) == (0, GIB)
 
 
-def test_less_is_charged_where_a_part_of_it_was_visibly_taken() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_less_is_charged_where_a_part_of_it_was_visibly_taken(driver: CoreDriver) -> None:
     driver.device.unlisted.add(ProcessKey(101, 707))
     det, lease = held(driver, "det", 5)
     det.unloading(lease)
@@ -106,8 +103,7 @@ def test_one_that_expired_in_its_load_is_charged_for_what_nobody_explains() -> N
     assert driver.gpu()["charged_bytes"] == 3 * GIB
 
 
-def test_where_the_list_has_no_bytes_all_of_it_stays_charged() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_where_the_list_has_no_bytes_all_of_it_stays_charged(driver: CoreDriver) -> None:
     driver.device.unlisted.add(ProcessKey(101, 707))
     driver.device.knows_bytes = False
     driver.device.set(BROWSER, GIB, driver.now)
@@ -149,9 +145,8 @@ def test_two_that_nobody_lists_change_places() -> None:
     assert driver.gpu()["charged_bytes"] == 5 * GIB
 
 
-def test_one_that_comes_onto_the_list_has_not_grown() -> None:
+def test_one_that_comes_onto_the_list_has_not_grown(driver: CoreDriver) -> None:
     """Its bytes were on the GPU before, so they do not make up for what another one keeps."""
-    driver = CoreDriver(8 * GIB)
     driver.device.unlisted |= {ProcessKey(101, 707), ProcessKey(102, 714)}
     held(driver, "other", 3)
     det, lease = held(driver, "det", 3)
@@ -164,18 +159,16 @@ def test_one_that_comes_onto_the_list_has_not_grown() -> None:
     assert driver.gpu()["charged_bytes"] == 6 * GIB
 
 
-def test_one_that_comes_onto_the_list_by_its_load_has_grown() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_one_that_comes_onto_the_list_by_its_load_has_grown(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 3)
     change_places(driver, det, lease)
     assert verdicts(driver) == [("verified", True)]
     assert driver.gpu()["charged_bytes"] == 3 * GIB
 
 
-def test_what_another_holder_grew_by_right_hides_no_dead_one() -> None:
+def test_what_another_holder_grew_by_right_hides_no_dead_one(driver: CoreDriver) -> None:
     """Regression: growth within a charge counted twice, as allowed and as taken, so a dead holder's
     bytes were granted again."""
-    driver = CoreDriver(8 * GIB)
     driver.device.lag_s = 15.0
     other, _ = held(driver, "other", 4)
     other.hold(2 * GIB)
@@ -193,8 +186,7 @@ def test_what_another_holder_grew_by_right_hides_no_dead_one() -> None:
     assert verdicts(driver)[-1] == ("verified", True)
 
 
-def test_a_process_that_is_known_by_its_pid_alone_is_no_stranger() -> None:
-    driver = CoreDriver(8 * GIB)
+def test_a_process_that_is_known_by_its_pid_alone_is_no_stranger(driver: CoreDriver) -> None:
     det, _ = held(driver, "det", 3)
     ledger = driver.arbiter.inspect().gpus[driver.device.gpu].ledger
     assert (
@@ -298,8 +290,7 @@ def test_what_a_process_keeps_is_restored_beside_its_lease() -> None:
     same, which lie within their leases."""
     driver = hidden_gpu(lists=False)
     small, first = held(driver, "small", 0.5, residue_bytes=450 * MIB)
-    small.unload(first)
-    driver.until(lambda: driver.state(first) == "over")
+    give_back(driver, small, first)
     small.hold(450 * MIB)
     _, second = held(driver, "small", 0.5, small)
     big, lease = held(driver, "big", 7)

@@ -2,113 +2,35 @@
 is read through the real one (`test_nvml_library`)."""
 
 import os
-from types import SimpleNamespace
 
 import pytest
 
+from tests.support.nvml_module import GIB, NVMLError, NvmlModule, a_gpu
 from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
 from vram_arbiter.arbiter.host.gpu.pids import PidMap
 from vram_arbiter.schemas.errors import NoGpu, ProbeFailed, UnknownGpu
 from vram_arbiter.schemas.ids import GpuId
 
-GIB = 2**30
-
-
-class NVMLError(Exception):
-    pass
-
-
-class NotSupported(NVMLError):
-    pass
-
-
-class Driver:
-    """Answers as `pynvml` does, for GPUs given as dictionaries."""
-
-    NVMLError = NVMLError
-    NVMLError_NotSupported = NotSupported
-    NVMLError_FunctionNotFound = NotSupported
-    nvmlMemory_v2 = 2
-
-    def __init__(self, *gpus, init_error=None):
-        self.gpus = gpus
-        self.init_error = init_error
-        self.shutdowns = 0
-
-    def nvmlInit(self):
-        if self.init_error:
-            raise self.init_error
-
-    def nvmlShutdown(self):
-        self.shutdowns += 1
-        if self.shutdowns > 1:
-            raise NVMLError("Uninitialized")
-
-    def nvmlDeviceGetCount(self):
-        return len(self.gpus)
-
-    def nvmlDeviceGetHandleByIndex(self, index):
-        return self.gpus[index]
-
-    def nvmlDeviceGetIndex(self, handle):
-        return handle["index"]
-
-    def nvmlDeviceGetUUID(self, handle):
-        return handle["uuid"]
-
-    def nvmlDeviceGetName(self, handle):
-        return handle.get("name", "NVIDIA GPU")
-
-    def nvmlDeviceGetMigMode(self, handle):
-        if "mig" not in handle:
-            raise NotSupported("Not Supported")
-        return [handle["mig"], handle["mig"]]
-
-    def nvmlDeviceGetMemoryInfo(self, handle, version=None):
-        if "memory_error" in handle:
-            raise handle["memory_error"]
-        return SimpleNamespace(
-            total=handle["total"], reserved=handle["reserved"], used=handle["used"]
-        )
-
-    def nvmlDeviceGetComputeRunningProcesses(self, handle):
-        return [
-            SimpleNamespace(pid=pid, usedGpuMemory=size) for pid, size in handle.get("compute", [])
-        ]
-
-    def nvmlDeviceGetGraphicsRunningProcesses(self, handle):
-        return []
-
-
-def a_gpu(**changes):
-    return {
-        "uuid": "GPU-1",
-        "index": 0,
-        "total": 8 * GIB,
-        "reserved": GIB // 4,
-        "used": GIB,
-    } | changes
-
 
 def test_gpus_come_in_the_drivers_order_under_their_uuids():
-    probe = NvmlProbe(Driver(a_gpu(uuid="GPU-b", index=1), a_gpu(uuid="GPU-a", index=0)))
+    probe = NvmlProbe(NvmlModule(a_gpu(uuid="GPU-b", index=1), a_gpu(uuid="GPU-a", index=0)))
     assert [found.id for found in probe.gpus()] == ["GPU-a", "GPU-b"]
 
 
 def test_no_driver_no_gpu_unknown_gpu():
     with pytest.raises(NoGpu, match="--gpu fake:8GiB"):
-        NvmlProbe(Driver(init_error=NVMLError("Driver Not Loaded")))
-    empty = Driver()
+        NvmlProbe(NvmlModule(init_error=NVMLError("Driver Not Loaded")))
+    empty = NvmlModule()
     with pytest.raises(NoGpu, match="knows no GPU"):
         NvmlProbe(empty)
     assert empty.shutdowns == 1
     with pytest.raises(UnknownGpu):
-        NvmlProbe(Driver(a_gpu())).sample(GpuId("GPU-2"))
+        NvmlProbe(NvmlModule(a_gpu())).sample(GpuId("GPU-2"))
 
 
 def test_one_gpu_that_fails_does_not_disturb_the_other():
     lost, fine = a_gpu(), a_gpu(uuid="GPU-2", index=1, used=5)
-    driver = Driver(lost, fine)
+    driver = NvmlModule(lost, fine)
     probe = NvmlProbe(driver)
     lost["memory_error"] = NVMLError("GPU is lost")
     for _ in range(3):
@@ -123,12 +45,12 @@ def test_one_gpu_that_fails_does_not_disturb_the_other():
 def test_a_list_whose_pids_mean_nothing_here_is_no_evidence(tmp_path):
     (tmp_path / "self" / "ns").mkdir(parents=True)
     os.symlink("pid:[4026532999]", tmp_path / "self" / "ns" / "pid")
-    probe = NvmlProbe(Driver(a_gpu(compute=[(os.getpid(), 300)])), PidMap(proc=tmp_path))
+    probe = NvmlProbe(NvmlModule(a_gpu(compute=[(os.getpid(), 300)])), PidMap(proc=tmp_path))
     assert probe.sample(GpuId("GPU-1")).processes is None
 
 
 def test_closing_twice_is_harmless():
-    driver = Driver(a_gpu())
+    driver = NvmlModule(a_gpu())
     probe = NvmlProbe(driver)
     probe.close()
     probe.close()

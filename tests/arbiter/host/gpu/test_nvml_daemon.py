@@ -127,30 +127,14 @@ def test_a_call_that_hangs_is_unknown_blocks_and_recovers(
     client.push("granted")
 
 
-@pytest.mark.parametrize(
-    ("code", "words"), [(15, "GPU is lost"), (999, "Unknown Error"), (3, "Not Supported")]
-)
-def test_an_error_code_is_unknown_blocks_and_recovers(
-    client: WireClient, nvml: NvmlStub, code: int, words: str
-) -> None:
+def test_an_error_code_is_unknown_blocks_and_recovers(client: WireClient, nvml: NvmlStub) -> None:
     assert client.ask("subscribe")["ok"]
-    nvml.write(f"error memory {code}")
-    event(client, "probe_failed", lambda told: words in told["reason"])
+    nvml.write("error memory 15")
+    event(client, "probe_failed", lambda told: "GPU is lost" in told["reason"])
     assert client.acquire("next", GIB)["state"] == "queued"
     nvml.write()
     event(client, "probe_ok")
     client.push("granted")
-
-
-def test_bytes_that_stay_are_charged_to_the_process_that_holds_them(
-    client: WireClient, nvml: NvmlStub
-) -> None:
-    assert client.ask("subscribe")["ok"]
-    on = held_here(client, nvml, 5 * GIB)
-    let_go(client, nvml, on, 2 * GIB, f"process 0 compute {ME} {2 * GIB}")
-    verdict = event(client, "verified")
-    assert (verdict["verdict"], verdict["culprits"][0]["pid"]) == ("residue", ME)
-    assert client.ask("status")["gpus"][0]["charged_bytes"] == 2 * GIB
 
 
 @pytest.mark.parametrize(("left", "verdict"), [(0, "verified"), (2 * GIB, "residue")])
@@ -169,27 +153,6 @@ def test_where_bytes_per_process_are_na_the_total_decides(
     said = event(client, "verified")
     assert (said["verdict"], said["culprits"]) == (verdict, [])
     assert client.ask("status")["gpus"][0]["charged_bytes"] == left
-
-
-def test_a_stowaway_is_named_and_charged_as_reserve(client: WireClient, nvml: NvmlStub) -> None:
-    assert client.ask("subscribe")["ok"]
-    parent = os.getppid()
-    nvml.gpu(3 * GIB)
-    nvml.write(f"process 0 graphics {parent} {3 * GIB}")
-    found = event(client, "stowaway")
-    assert (found["pid"], found["used_bytes"]) == (parent, 3 * GIB)
-    assert found["name"], "with the name of its program"
-    assert client.acquire("next", 6 * GIB)["state"] == "queued"
-
-
-def test_mig_mode_is_an_error_of_the_configuration(make_arbiter: Make, nvml: NvmlStub) -> None:
-    nvml.gpu(0, more="mig")
-    nvml.write()
-    arbiter = make_arbiter(gpu="nvml")
-    assert arbiter.spawn(nvml.environ).wait(60) == 2
-    assert "MIG mode" in arbiter.log
-    assert "-mig 0" in arbiter.log
-    assert "Traceback" not in arbiter.log
 
 
 def test_the_daemon_makes_no_cuda_context(daemon: ArbiterProcess) -> None:

@@ -8,11 +8,11 @@ The files have the layout of those machines (the GB10's totals are those that an
 import os
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from tests.support.nvml_module import GIB, NotSupported, NVMLError, NvmlModule, a_gpu
 from vram_arbiter.arbiter.host.gpu.pids import PidMap
 from vram_arbiter.arbiter.host.gpu.probe import GpuDevice
 from vram_arbiter.arbiter.host.gpu.unified import (
@@ -29,76 +29,19 @@ from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, Unknown
 from vram_arbiter.schemas.ids import GpuId
 
 MACHINES = Path(__file__).with_name("machines")
-KIB, GIB = 2**10, 2**30
+KIB = 2**10
 PIDS = PidMap("own")
 
 
-class NVMLError(Exception):
-    pass
-
-
-class NotSupported(NVMLError):
-    pass
-
-
-class Nvml:
-    """`pynvml` with one GPU whose memory may be NOT_SUPPORTED."""
-
-    NVMLError, NVMLError_NotSupported, NVMLError_FunctionNotFound = (
-        NVMLError,
-        NotSupported,
-        NotSupported,
-    )
-    nvmlMemory_v2 = 2
-
-    def __init__(
-        self,
-        memory: Exception | None = None,
-        driver: Exception | None = None,
-        used: int | None = 7 * GIB,
-    ) -> None:
-        self.memory, self.driver, self.used = memory, driver, used
-
-    def nvmlInit(self) -> None:
-        if self.driver is not None:
-            raise self.driver
-
-    def nvmlShutdown(self) -> None:
-        pass
-
-    def nvmlDeviceGetCount(self) -> int:
-        return 1
-
-    def nvmlDeviceGetHandleByIndex(self, index: int) -> int:
-        return index
-
-    def nvmlDeviceGetIndex(self, handle: int) -> int:
-        return handle
-
-    def nvmlDeviceGetUUID(self, handle: int) -> str:
-        return "GPU-gb10"
-
-    def nvmlDeviceGetName(self, handle: int) -> str:
-        return "NVIDIA GB10"
-
-    def nvmlDeviceGetMigMode(self, handle: int) -> list[int]:
-        raise NotSupported("Not Supported")
-
-    def nvmlDeviceGetMemoryInfo(self, handle: int, version: int = 0) -> Any:
-        if self.memory is not None:
-            raise self.memory
-        return SimpleNamespace(total=8 * GIB, used=GIB, reserved=0)
-
-    def nvmlDeviceGetComputeRunningProcesses(self, handle: int) -> list[Any]:
-        return [SimpleNamespace(pid=os.getpid(), usedGpuMemory=self.used)]
-
-    def nvmlDeviceGetGraphicsRunningProcesses(self, handle: int) -> list[Any]:
-        return []
-
-
-NO_DRIVER = Nvml(driver=NVMLError("Driver Not Loaded"))
-UMA = Nvml(memory=NotSupported("Not Supported"))
-DISCRETE = Nvml()
+GB10 = {
+    "uuid": "GPU-gb10",
+    "name": "NVIDIA GB10",
+    "reserved": 0,
+    "compute": [(os.getpid(), 7 * GIB)],
+}
+NO_DRIVER = NvmlModule(init_error=NVMLError("Driver Not Loaded"))
+UMA = NvmlModule(a_gpu(**GB10, memory_error=NotSupported("Not Supported")))
+DISCRETE = NvmlModule(a_gpu(**GB10))
 
 
 @pytest.fixture
@@ -226,7 +169,9 @@ def test_main_memory_never_stands_for_a_gpu_that_has_its_own(tmp_path: Path) -> 
 
 
 def test_a_lost_gpu_is_no_reason_to_read_main_memory(tmp_path: Path) -> None:
-    probe, chosen = choose("auto", PIDS, tmp_path, Nvml(memory=NVMLError("GPU is lost")))
+    probe, chosen = choose(
+        "auto", PIDS, tmp_path, NvmlModule(a_gpu(memory_error=NVMLError("GPU is lost")))
+    )
     assert chosen == "nvml"
     with pytest.raises(ProbeFailed, match="GPU is lost"):
         probe.gpus()
