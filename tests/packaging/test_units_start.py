@@ -287,6 +287,7 @@ asyncio.run(load())
 
 
 @pytest.mark.heavy
+@pytest.mark.nightly  # three programs import torch once more
 def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
     """A model loads under a lease, a robot is stopped, and a task fails because of that, each as
     its unit's user."""

@@ -297,14 +297,3 @@ def test_what_the_environment_gets_wrong_ends_the_start(
     assert done.returncode == 2
     assert words in done.stderr
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("section", ["http", "telemetry"])
-def test_sections_that_moved_are_refused_with_their_new_place(
-    make_arbiter: Make, section: str
-) -> None:
-    refused = make_arbiter(config=f"{section}: {{}}\n")
-    with pytest.raises(RuntimeError, match="ended with 2"):
-        refused.start()
-    assert f":1: {section}: is not a section any more" in refused.log
-    assert "vram-observer" in refused.log

@@ -88,6 +88,7 @@ def offline(monkeypatch: pytest.MonkeyPatch, cache: Path) -> None:
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", cache)
 
 
+@pytest.mark.nightly  # lerobot's program, and another import of all of lerobot
 def test_lerobot_replay_drives_a_robot_with_the_recorded_actions(
     root: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

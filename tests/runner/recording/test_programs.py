@@ -59,6 +59,7 @@ def start_recording(tmp_path: Path) -> Iterator[Start]:
         process.communicate()
 
 
+@pytest.mark.nightly  # each step of a crash is in test_commit
 def test_the_episode_of_a_killed_simulator_is_finished_by_its_writer(
     start_recording: Start, tmp_path: Path
 ) -> None:
