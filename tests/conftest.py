@@ -56,6 +56,31 @@ LONGEST = (
 """Where the longest tests are: begun last, one worker would end minutes after the other."""
 
 
+IMPORTING = (
+    "tests/sidecars/adapters/",
+    "tests/sidecars/test_quantization.py",
+    "tests/runner/recording/test_lerobot_format.py",
+    "tests/runner/recording/test_recorder.py",
+    "tests/runner/robots/test_lerobot_robot.py",
+    "tests/runner/skills/test_policies_as_lerobot.py",
+    "tests/training/",
+)
+"""Where tests import torch, transformers and lerobot: for one worker, because each that imports
+them takes 15 s of a core for it."""
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give each worker one file after another, as `--dist loadfile` does, and one of them all of
+    IMPORTING."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByFile(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return "importing" if nodeid.startswith(IMPORTING) else super()._split_scope(nodeid)
+
+    return ByFile(config, log) if config.getvalue("dist") == "loadfile" else None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the longest files; the order within a file stays."""
 

@@ -103,9 +103,10 @@ def test_every_grant_is_delivered_once_across_restarts(
         arbiter_daemon.start()
         grant(2)
         until(lambda: grown_to(4), PATIENCE_S)
+        # a stop would cut the last one short
+        until(lambda: observer.log.count("false failed with exit code 1") == 4, PATIENCE_S)
         assert observer.stop() == 0, observer.log
         assert observer.log.count("keep: event") == 4
-        assert observer.log.count("false failed with exit code 1") == 4
         evicted = json.loads(Path(f"{file}.out").read_text())
         assert (evicted["kind"], evicted["consumer"]) == ("unloading", "leaves")
         grant(1)  # meanwhile
