@@ -43,6 +43,7 @@ Run = Callable[[Any], Any]
 
 
 # -- the interval
+@pytest.mark.heavy  # the interval is SciPy's
 @pytest.mark.parametrize(
     ("successes", "of", "low", "high"),
     # Wilson's score interval without continuity correction, as statsmodels' `proportion_confint(…,
@@ -59,6 +60,7 @@ def test_wilsons_interval(successes: int, of: int, low: float, high: float) -> N
     assert wilson(successes, of) == pytest.approx((low, high), abs=5e-5)
 
 
+@pytest.mark.heavy
 @given(st.integers(1, 5000).flatmap(lambda of: st.tuples(st.integers(0, of), st.just(of))))
 def test_the_interval_holds_the_rate_and_mirrors(counts: tuple[int, int]) -> None:
     successes, of = counts
@@ -100,6 +102,7 @@ class Played:
         return PolicySkill(name, policy_of(name), self.world)
 
 
+@pytest.mark.heavy
 def test_one_reset_a_seed_and_a_verdict_each(run_async: Run) -> None:
     one = Played()
     cell: Cell = run_async(one.bench.run(one.policy(LOST), range(20, 25)))
@@ -133,6 +136,7 @@ def test_a_rate_paces_the_ticks_and_standing_is_counted(run_async: Run) -> None:
     assert clock.slept == pytest.approx([1 / 20] * 3)
 
 
+@pytest.mark.heavy
 def test_a_policy_with_a_defect_fails_and_one_that_gives_up_is_judged(run_async: Run) -> None:
     one = Played()
     cell: Cell = run_async(one.bench.run(one.policy(LOST), (12, 13, 14)))
