@@ -276,6 +276,52 @@ def test_the_site_is_built_without_a_warning_and_needs_no_other_host(site: Path)
 
 
 @pytest.mark.heavy
+def test_the_search_index_is_small(site: Path) -> None:
+    """A browser loads and builds it at the first search: 700 kB took it half a second."""
+    assert (site / "search/search_index.json").stat().st_size < 550_000
+
+
+# Text and background of the theme, by scheme: hex colors, or properties of docs/site.css.
+TEXTS = {
+    "default": [
+        ("--md-primary-fg-color", "#ffffff"),  # links, and the header the other way round
+        ("--md-primary-fg-color", "#f5f5f5"),  # links in code
+        ("--md-accent-fg-color", "#ffffff"),
+        ("--md-default-fg-color--light", "#f5f5f5"),  # comments in code
+    ],
+    "slate": [
+        ("#00ccb8", "#272a35"),  # links in code
+        ("--md-accent-fg-color", "#1e2129"),
+        ("--md-default-fg-color--light", "#272a35"),
+        ("--md-code-hl-constant-color", "#272a35"),
+        ("--md-code-hl-number-color", "#272a35"),
+    ],
+}
+
+
+def luminance(color: str) -> float:
+    """Return the relative luminance of `#rrggbb` as WCAG 2 defines it."""
+    parts = [int(color[at : at + 2], 16) / 255 for at in (1, 3, 5)]
+    red, green, blue = (
+        part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts
+    )
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+@pytest.mark.parametrize("scheme", TEXTS)
+def test_texts_of_the_site_have_the_contrast_of_wcag_aa(scheme: str) -> None:
+    """White on the theme's teal had 3.8:1, the tabs 2.6:1."""
+    style = (TREE / "docs/site.css").read_text(encoding="utf-8")
+    colors: dict[str, str] = {}
+    for selector, body in re.findall(r"^(\[.*?) \{(.*?)\}", style, re.MULTILINE | re.DOTALL):
+        if "scheme" not in selector or scheme in selector:
+            colors |= dict(re.findall(r"(--[\w-]+): (#\w{6});", body))
+    for text, background in TEXTS[scheme]:
+        pair = sorted((luminance(colors.get(text, text)), luminance(background)))
+        assert (pair[1] + 0.05) / (pair[0] + 0.05) >= 4.5, (text, background)
+
+
+@pytest.mark.heavy
 def test_the_reference_has_every_command_key_and_error(site: Path) -> None:
     for program, parser in programs().items():
         text = (site / f"reference/cli/{program}.html").read_text(encoding="utf-8")
