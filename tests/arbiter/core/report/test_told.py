@@ -101,6 +101,15 @@ def test_an_acquire_said_again_after_the_load_is_answered_as_granted(driver: Cor
     assert (again["state"], again["lease"]["state"]) == ("loading", "held")
 
 
+def test_what_never_fits_says_the_way_out(driver: CoreDriver) -> None:
+    refused = refusal(driver.consumer("big").try_acquire(8 * GIB))
+    assert (refused.code, refused.hint) == (
+        "vram_insufficient",
+        "use a smaller model or a lower precision",
+    )
+    assert refused.message == "big needs 8 GiB; the GPU has 8 GiB less a reserve of 300 MiB"
+
+
 def test_refusals_of_operators_say_why(driver: CoreDriver) -> None:
     _, lease = held(driver, "det", 5)
     waiting = driver.consumer("vlm").acquire(5 * GIB)
