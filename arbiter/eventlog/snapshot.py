@@ -81,7 +81,7 @@ class _Graph:
 
 @cache
 def _name(kind: type) -> str:
-    """Raises CodecError for a class that is no class of the engine."""
+    """Raises CodecError for a class that is not the engine's."""
     if not kind.__module__.startswith(_HOMES):
         raise CodecError(
             f"{kind.__module__}.{kind.__qualname__} has no place in the engine's state"

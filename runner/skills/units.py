@@ -26,7 +26,7 @@ _OPENING = {
 def opening(convention: GripperConvention) -> Scale:
     """Return the map to an opening of 0..1. Raises ValueError for a convention of the joint."""
     if convention not in _OPENING:
-        raise ValueError(f"{convention} is no convention of a gripper that is on or off")
+        raise ValueError(f"{convention} is not a convention of a gripper that is on or off")
     return _OPENING[convention]
 
 

@@ -52,26 +52,6 @@ def test_3_an_unload_that_hangs_holds_up_nobody_who_can_be_served_without_it(ask
 
 
 # -- 4: thrash and starvation
-def test_4_equals_take_turns_at_safe_points(driver: CoreDriver) -> None:
-    """The second of two equals waited for ever. Each stays for its minimum residency at least, and
-    finishes its use."""
-    people = {name: driver.consumer(name) for name in ("a", "b")}
-    leases = {name: one.acquire(5 * GIB, min_residency_s=2.0) for name, one in people.items()}
-    for name, other in (("a", "b"), ("b", "a"), ("a", "b")):
-        person, lease = people[name], leases[name]
-        driver.until(lambda lease=lease: driver.state(lease) == "loading")
-        person.load(lease)
-        person.use_begin(lease)
-        driver.advance(1.9)
-        assert driver.state(lease) == "held"
-        driver.until(lambda lease=lease: driver.state(lease) == "revoking")
-        driver.advance(60.0)
-        assert driver.state(leases[other]) == "queued", "it is in use"
-        person.use_end(lease)
-        person.unload(lease)
-        leases[name] = person.acquire(5 * GIB, min_residency_s=2.0)
-
-
 def test_4_six_that_fit_do_not_wait_for_one_that_idles(driver: CoreDriver) -> None:
     """aprender#3986: one lock for the whole GPU, held for 25 minutes at 97 % idle, six waiters.
     Bytes are leased, not the GPU."""

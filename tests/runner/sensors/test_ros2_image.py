@@ -260,7 +260,7 @@ def test_the_last_picture_of_a_publisher_that_left_is_not_shown_after_it(topic: 
         waitset.wait(duration(milliseconds=100))
     publisher.close()
     while not source.read_status(DDSStatus.SubscriptionMatched):
-        assert clock.now_s() < until_s, "nobody noticed that it left"
+        assert clock.now_s() < until_s, "its end went unnoticed"
         waitset.wait(duration(milliseconds=100))
     reader._attend(feed, source)
     assert "has no publisher" in slot._reason
