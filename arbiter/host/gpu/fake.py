@@ -55,9 +55,7 @@ class FakeProbe:
             raise UnknownGpu(f"no simulated GPU {gpu}", details={"known": sorted(self._folders)})
         folder = self._folders[gpu]
         try:
-            self._suffer(folder)
-            with locked(folder):
-                state = settled(folder)
+            state = self._state(folder)
         except (ConfigError, OSError, UnicodeDecodeError) as error:
             raise ProbeFailed(
                 f"the simulated GPU in {folder} cannot be read: {error}",
@@ -75,15 +73,19 @@ class FakeProbe:
     def close(self) -> None:
         self._closed.set()
 
-    def _suffer(self, folder: Path) -> None:
-        """Fail or hang as the GPU's faults say; a hang ends with the fault or with `close`."""
-        while (
-            fault := fakegpu.parse_config((folder / fakegpu.GPU_FILE).read_text()).faults.probe
-        ) != "ok":
-            if fault == "fail":
-                raise ProbeFailed(
-                    "the probe fails because gpu.json says so", hint='set faults.probe to "ok"'
-                )
+    def _state(self, folder: Path) -> fakegpu.GpuState:
+        """The GPU as it is now. It fails or hangs as its faults say; a hang ends with the fault or
+        with `close`."""
+        while True:
+            with locked(folder):
+                state = settled(folder)
+            match state.config.faults.probe:
+                case "ok":
+                    return state
+                case "fail":
+                    raise ProbeFailed(
+                        "the probe fails because gpu.json says so", hint='set faults.probe to "ok"'
+                    )
             if self._closed.wait(_HANG_POLL_S):
                 raise ProbeFailed("the probe was closed while it hung")
 
