@@ -5,10 +5,11 @@ The digest is over all bytes of the effects, in order. Knows nothing of files.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from hashlib import blake2b
+from operator import attrgetter
 from typing import Any, Final, get_args
 
 import msgpack
@@ -37,8 +38,7 @@ def decode_event(name: str, data: object) -> Event:
 def digest(effects: Sequence[Effect]) -> str:
     """16 hex digits over every byte of the effects, in their order. The same decisions give the
     same digest, on any machine."""
-    packed = msgpack.packb([_packable(effect) for effect in effects], default=_packable)
-    return blake2b(packed, digest_size=8).hexdigest()
+    return blake2b(_pack(list(effects)), digest_size=8).hexdigest()
 
 
 def summary(effects: Sequence[Effect]) -> str:
@@ -65,13 +65,19 @@ def _as_plain(value: Any) -> Any:
 _JSON = json.JSONEncoder(separators=(",", ":"), default=_as_plain)
 
 
-def _packable(value: Any) -> Any:
-    if is_dataclass(value):
-        kind: Any = type(value)
-        return [kind.__name__, *[getattr(value, name) for name in _names(kind)]]
-    return _as_plain(value)
-
-
 @cache
-def _names(cls: Any) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(cls))
+def _values_of(cls: Any) -> Callable[[Any], Sequence[object]] | None:
+    """Return what takes a dataclass apart: the name of its class and its values."""
+    names = [field.name for field in fields(cls)] if is_dataclass(cls) else []
+    # with one name alone it would return that value
+    return attrgetter("__class__.__name__", *names) if names else None
+
+
+def _packable(value: Any) -> Any:
+    cls: Any = type(value)
+    take_apart = _values_of(cls)
+    return _as_plain(value) if take_apart is None else take_apart(value)
+
+
+_pack: Callable[[object], bytes] = msgpack.Packer(default=_packable).pack
+"""One for all: each has a buffer of its own, of 256 KiB."""
