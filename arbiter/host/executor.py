@@ -7,7 +7,7 @@ are behind the protocols below. Mints the ids of the daemon's spans (`SpanIds`).
 """
 
 import logging
-import os
+import random
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ _NOTHING: Mapping[str, JournalUnavailable] = {}
 OPEN_MAX = 32_768
 """Waits that are open at a time, and as many evictions: twice the waiters that the default limits
 allow. The oldest is forgotten when one more begins."""
-_TRACE_BYTES, _SPAN_BYTES = 16, 8
+_TRACE_BITS, _SPAN_BITS = 128, 64
 _NO_SPAN: Mapping[str, str] = {}
 
 
@@ -86,8 +86,7 @@ class SpanIds:
     `outgoing` before a batch is performed, `revoke` for each push of it, `of` for each note.
     """
 
-    def __init__(self, random: Callable[[int], bytes] = os.urandom) -> None:
-        self._random = random
+    def __init__(self) -> None:
         self._waits: dict[LeaseId, SpanId] = {}
         self._evictions: dict[LeaseId, SpanId] = {}
 
@@ -147,7 +146,7 @@ class SpanIds:
             made = self._minted(None)
         else:
             above = self._wait(waiter, traceparent)
-            made = replace(above, span=self._hex(_SPAN_BYTES), parent=above.span)
+            made = replace(above, span=_hex(_SPAN_BITS), parent=above.span)
         self._evictions.pop(holder, None)
         _keep(self._evictions, holder, made)
 
@@ -159,14 +158,16 @@ class SpanIds:
 
     def _minted(self, traceparent: str | None) -> SpanId:
         """Return a child of a W3C traceparent, else the first span of a trace."""
-        span, given = self._hex(_SPAN_BYTES), read_traceparent(traceparent)
+        span, given = _hex(_SPAN_BITS), read_traceparent(traceparent)
         if given is None:
-            return SpanId(self._hex(_TRACE_BYTES), span)
+            return SpanId(_hex(_TRACE_BITS), span)
         _, trace, parent, flags = given.split("-")
         return SpanId(trace, span, parent, flags)
 
-    def _hex(self, count: int) -> str:
-        return self._random(count).hex()
+
+def _hex(bits: int) -> str:
+    """A random number, as OpenTelemetry's own generator makes it; zero means "no id" there."""
+    return f"{random.getrandbits(bits) or 1:0{bits // 4}x}"
 
 
 def _keep(spans: dict[LeaseId, SpanId], lease: LeaseId, made: SpanId) -> None:
