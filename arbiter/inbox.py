@@ -90,8 +90,8 @@ class Inbox:
     longer be trusted, so nothing is handled after that. `slept_s` tells for how long the machine
     was suspended since it was last asked; the engine hears of it, and of a stop of this process
     alone, before any other event. `record` is told of every event and what came of it (None: the
-    engine raised), before anything is performed. `sample` begins a reading of a GPU, which ends in
-    an event (`MemorySampled` or `ProbeFailed`).
+    engine raised) once that is performed: no answer waits for it. `sample` begins a reading of a
+    GPU, which ends in an event (`MemorySampled` or `ProbeFailed`).
     """
 
     def __init__(
@@ -206,17 +206,17 @@ class Inbox:
     def _handle(self, event: Event) -> None:
         now, effects = self._clock(), None
         try:
-            effects = self._core.handle(event, now)
-            if self._record is not None:
-                self._record(now, event, effects)
-            self.perform(effects)
+            try:
+                effects = self._core.handle(event, now)
+                self.perform(effects)
+            finally:
+                if self._record is not None:
+                    self._record(now, event, effects)
             self._handled += 1
         except Exception as error:  # outermost: an engine that raised has an unknown state
             log.critical("the core failed on %s: %s", without_tokens(event), error, exc_info=error)
             log.critical("state of the core: %s", self._state())
             self.close()
-            if effects is None and self._record is not None:
-                self._record(now, event, None)
             self._failed(error)
 
     def _answer(self) -> None:

@@ -239,22 +239,33 @@ def test_a_core_that_raises_ends_everything_once() -> None:
     with_inbox(test)
 
 
-def test_everything_that_is_handled_is_recorded_before_it_is_performed() -> None:
+def test_what_is_handled_is_recorded_once_its_answers_are_out() -> None:
+    """Also where performing it raised, or the engine itself."""
+
     async def run() -> None:
+        def perform(effects: Sequence[Effect]) -> None:
+            told.append("performed")
+            if len(core.seen) == 2:
+                raise OSError("no disk")
+
+        def inbox() -> Inbox:
+            return Inbox(core, perform, told.append, record=lambda *what: told.append(what))
+
         core, told = ScriptedCore(), list[Any]()
-        inbox = Inbox(
-            core,
-            lambda effects: told.append("performed"),
-            told.append,
-            record=lambda now, event, effects: told.append((now, event, effects)),
-        )
-        inbox.post(left("a"))
-        assert told == [(core.times[0], left("a"), [Note("seen", {"number": 1})]), "performed"]
+        first = inbox()
+        first.post(left("a"))
+        assert told == ["performed", (core.times[0], left("a"), [Note("seen", {"number": 1})])]
+        first.post(left("b"))
+        assert told[2:4] == [
+            "performed",
+            (core.times[1], left("b"), [Note("seen", {"number": 2})]),
+        ]
+        assert str(told[4]) == "no disk"
         core.broken = True
-        inbox.post(left("b"))
-        now, event, effects = told[2]
-        assert (event, effects, str(told[3])) == (left("b"), None, "invariant 1")
-        assert now >= core.times[0]
+        inbox().post(left("c"))
+        now, event, effects = told[5]
+        assert (event, effects, str(told[6])) == (left("c"), None, "invariant 1")
+        assert now >= core.times[1]
 
     asyncio.run(run())
 
