@@ -72,6 +72,16 @@ def test_a_holder_that_does_not_answer_at_the_deadline_no_longer_counts_as_leavi
     driver.until(lambda: driver.state(waiter) == "loading")
 
 
+def test_an_unload_that_hangs_is_late_and_not_reminded(driver: CoreDriver) -> None:
+    det, lease = held(driver, "det", 5)
+    driver.consumer("vlm").acquire(5 * GIB)
+    driver.advance(0.1)
+    det.unloading(lease)
+    driver.advance(driver.settings.revoke_deadline_s + 0.1)
+    assert len(driver.notes("deadline_passed")) == 1
+    assert driver.notes("reminded") == []
+
+
 def test_a_voluntary_release_while_asked_is_as_good(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)

@@ -5,7 +5,7 @@ from typing import Any
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.scenes import give_back
-from vram_arbiter.arbiter.core.effects import Note
+from vram_arbiter.arbiter.core.effects import Note, Push
 from vram_arbiter.arbiter.core.events import (
     Asked,
     ClientConnected,
@@ -259,6 +259,19 @@ def test_who_lets_go_after_a_restart_without_coming_back_is_waited_for_no_longer
     vlm.hold(0)
     driver.until(lambda: driver.status()["phase"] == "serving", limit_s=0.1)
     assert (driver.state(lease), driver.state(other)) == ("held", "over")
+
+
+def test_a_revoke_goes_to_the_connection_that_reattached(driver: CoreDriver) -> None:
+    """Another of its process, which is as good where that one is gone, knows nothing of it."""
+    det, lease, token = held_with_token(driver, "det", 5)
+    driver.restart()
+    driver.post(ClientConnected(ClientId("a-sibling"), det.process, 1000, "a", "a-sibling"))
+    det.connect()
+    det.reattach(lease, token)
+    driver.consumer("vlm").acquire(5 * GIB)
+    driver.until(lambda: driver.state(lease) == "revoking")
+    pushed = [e for e in driver.effects if isinstance(e, Push)]
+    assert [(e.client, e.body.TAG[1]) for e in pushed] == [(det.client, "revoke")]
 
 
 def test_verifications_and_debts_go_on_after_the_restart(driver: CoreDriver) -> None:

@@ -266,6 +266,26 @@ def test_a_newcomer_that_has_left_before_a_reading_ends_hides_no_release(ends: s
     assert driver.until(lambda: driver.state(lease) == "over") > 1.5
 
 
+def test_a_load_that_its_process_did_not_survive_hides_no_release() -> None:
+    """It died while a reading was under way, which may have seen none of what it is charged for:
+    after a restart, without a baseline, its debt would cover what is going."""
+    driver = hidden_gpu(lists=False)
+    small, lease = held(driver, "small", 0.5)
+    driver.advance(1.0)
+    driver.device.lag_s = 2.0
+    newcomer = driver.consumer("newcomer")
+    wanted = newcomer.acquire(1 * GIB)
+    driver.until(lambda: driver.state(wanted) == "loading")
+    small.unload(lease)
+    driver.restart()
+    newcomer.connect()
+    newcomer.reattach(wanted, newcomer.token(wanted), held=False)
+    driver.device.reading_s = 1.0
+    driver.advance(0.1)
+    newcomer.die()
+    assert driver.until(lambda: driver.state(lease) == "over") > 1.5
+
+
 def test_what_its_own_process_loads_hides_no_release() -> None:
     """Regression: after a restart a load of the same process counted as present already and
     verified a release early (seed 20778062337)."""
