@@ -69,6 +69,7 @@ IMPORTING = (
 them takes 15 s of a core for it."""
 
 
+@pytest.hookimpl(optionalhook=True)  # `make mutation` runs without xdist
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Give each worker one file after another, as `--dist loadfile` does, and one of them all of
     IMPORTING."""
