@@ -24,7 +24,7 @@ WORKERS ?= 4
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core demo test test-core test-gpu nightly mutation measure lint format \
+.PHONY: help setup setup-core jetson demo test test-core test-gpu nightly mutation measure lint format \
 	chaos sim bench bench-switch schemas docs clean
 
 help: ## this list
@@ -35,6 +35,9 @@ setup: ## environment with everything (.venv)
 
 setup-core: ## environment of the base install (.venv-core)
 	@bash .ci/setup core
+
+jetson: ## as root on a Jetson: system packages, Cyclone DDS, NVIDIA's torch: ARGS=--dry-run
+	@bash .ci/jetson $(ARGS)
 
 demo: setup ## find, navigate, grab in 8 GiB: SEED=0 ARBITER=on|off GPU=fake:8GiB|nvml OUT=out/demo
 	$(BIN)/vramctl demo --seed $(SEED) --arbiter $(ARBITER) --gpu $(GPU) --out $(OUT) $(ARGS)

@@ -51,6 +51,7 @@ while IFS= read -r line <&3; do
     count=$((count + 1))
     case $line in
     *Ctrl-C*)
+        # shellcheck disable=SC2086  # words of a command
         timeout --foreground --signal=INT --kill-after=30 3 $typed
         code=$?
         [ "$code" = 124 ] || [ "$code" = 130 ] && code=0
