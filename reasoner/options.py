@@ -59,9 +59,12 @@ ENDPOINTS = (
     ("--listen", "socket for operators (default: ipc://RUNTIME/reasoner.sock)"),
     ("--runner", "the runner (default: ipc://RUNTIME/runner.sock)"),
     ("--arbiter", 'the arbiter, which is told what model follows; "none": it is not told'),
-    ("--detector", 'the detector sidecar; "none": there is none'),
-    ("--scene-vlm", 'the scene-VLM sidecar; "none": there is none'),
 )
+SIDECARS = (
+    ("--detector", 'the detector sidecar, or a manifest to start it from; "none": there is none'),
+    ("--scene-vlm", 'the scene-VLM sidecar, or a manifest to start it from; "none": there is none'),
+)
+SIDECAR = "ENDPOINT|MANIFEST"
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:
@@ -98,13 +101,15 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         parser.add_argument(flag, type=Path, metavar=metavar, help=text)
     for flag, text in ENDPOINTS:
         parser.add_argument(flag, metavar="ENDPOINT", help=text)
+    for flag, text in SIDECARS:
+        parser.add_argument(flag, metavar=SIDECAR, help=text)
     parser.add_argument(
         "--reward",
         nargs="?",
         const="",
-        metavar="ENDPOINT",
-        help="use a reward model to judge progress (default endpoint: ipc://RUNTIME/reward.sock);"
-        " without this flag there is none",
+        metavar=SIDECAR,
+        help="use a reward model to judge progress (default endpoint: ipc://RUNTIME/reward.sock),"
+        " or start it from a manifest; without this flag there is none",
     )
     parser.add_argument(
         "--reward-camera", default="wrist", help="camera of the reward model (default: %(default)s)"

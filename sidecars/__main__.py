@@ -31,6 +31,7 @@ from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.gpu_passthrough import need_gpu
 from vram_arbiter.sidecars.check import Wanted, check, need_packages, need_precision, report
 from vram_arbiter.sidecars.model_main import AdapterFor
+from vram_arbiter.sidecars.parent import end_with
 from vram_arbiter.sidecars.replaced import replaced
 from vram_arbiter.sidecars.settings import (
     NICE,
@@ -58,6 +59,8 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
     `adapter_for` lets a program serve a model of its own.
     """
     flags = parser().parse_args(arguments)
+    if flags.parent is not None:
+        end_with(flags.parent)
     # one service per model, so that a trace shows which one it was
     service = f"vram-sidecar-{flags.name}"
     human = f"%(asctime)s {flags.name} %(levelname)s %(message)s"
@@ -263,6 +266,7 @@ def parser() -> argparse.ArgumentParser:
         default=NICE,
         help="nice value of the process that loads and runs the model; default %(default)s",
     )
+    add("--parent", type=int, metavar="PID", help="end with this process, which starts the sidecar")
     add("--log-level", choices=("debug", "info", "warning", "error"), default="info")
     add("--log-format", choices=logs.FORMS, default="human", help="json: one object a line")
     add(
