@@ -20,13 +20,20 @@ from vram_arbiter.clients.net.server import path_of
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import ConfigError, VramError
 from vram_arbiter.schemas.fakegpu import FOLDER_VARIABLE
-from vram_arbiter.schemas.manifest import LICENSE_FLAG, LICENSE_HELP, ManifestError, RSkillManifest
+from vram_arbiter.schemas.manifest import (
+    LICENSE_FLAG,
+    LICENSE_HELP,
+    ManifestError,
+    RSkillManifest,
+    load_manifest,
+)
 from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint, program_endpoint
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry.commands import command
 from vram_arbiter.schemas.runtime.version import add_version
+from vram_arbiter.sidecars import environment
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.gpu_passthrough import need_gpu
 from vram_arbiter.sidecars.check import Wanted, check, need_packages, need_precision, report
@@ -69,6 +76,9 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
     try:
         for name, value in ENVIRONMENT.items():
             os.environ.setdefault(name, value)
+        if adapter_for is make_adapter:
+            file = shipped(flags.rskill, "rskills", flags.configs or configs_folder(os.environ))
+            environment.enter(load_manifest(file).environment, arguments or sys.argv[1:])
         if flags.check:
             return report(check(wanted_from(flags, adapter_for)), as_json=flags.as_json)
         settings = settings_from(flags)

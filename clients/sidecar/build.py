@@ -31,7 +31,7 @@ CLIENTS: Final[Mapping[Kind, type[SidecarClient]]] = {
     Kind.VLA: PolicyClient,
     Kind.REWARD: RewardClient,
 }
-BOOT_S = 600.0  # to the first answer: a new environment downloads its packages
+BOOT_S = 1800.0  # to the first answer: a new environment downloads its packages
 END_S = 15.0  # from SIGTERM to SIGKILL: the model leaves at its next safe point
 RESTART_S = 2.0  # as of the systemd units
 RESTARTS_MAX = 100
