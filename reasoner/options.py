@@ -55,16 +55,14 @@ FILES = (
         "with serve: append each finished task and its result, as lines of JSON",
     ),
 )
-ENDPOINTS = (
-    ("--listen", "socket for operators (default: ipc://RUNTIME/reasoner.sock)"),
-    ("--runner", "the runner (default: ipc://RUNTIME/runner.sock)"),
-    ("--arbiter", 'the arbiter, which is told what model follows; "none": it is not told'),
-)
-SIDECARS = (
-    ("--detector", 'the detector sidecar, or a manifest to start it from; "none": there is none'),
-    ("--scene-vlm", 'the scene-VLM sidecar, or a manifest to start it from; "none": there is none'),
-)
 SIDECAR = "ENDPOINT|MANIFEST"
+ENDPOINTS = (
+    ("--listen", "ENDPOINT", "socket for operators (default: ipc://RUNTIME/reasoner.sock)"),
+    ("--runner", "ENDPOINT", "the runner (default: ipc://RUNTIME/runner.sock)"),
+    ("--arbiter", "ENDPOINT", 'the arbiter, told what model follows; "none": it is not told'),
+    ("--detector", SIDECAR, 'the detector sidecar, or a manifest to start it; "none": no detector'),
+    ("--scene-vlm", SIDECAR, 'the scene-VLM sidecar, or a manifest to start it; "none": no VLM'),
+)
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:
@@ -99,14 +97,13 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         parser.add_argument(flag, action="store_true", help=text)
     for flag, metavar, text in FILES:
         parser.add_argument(flag, type=Path, metavar=metavar, help=text)
-    for flag, text in ENDPOINTS:
-        parser.add_argument(flag, metavar="ENDPOINT", help=text)
-    for flag, text in SIDECARS:
-        parser.add_argument(flag, metavar=SIDECAR, help=text)
+    for flag, metavar, text in ENDPOINTS:
+        parser.add_argument(flag, metavar=metavar, help=text)
     parser.add_argument(
         "--reward",
         nargs="?",
         const="",
+        default="none",
         metavar=SIDECAR,
         help="use a reward model to judge progress (default endpoint: ipc://RUNTIME/reward.sock),"
         " or start it from a manifest; without this flag there is none",

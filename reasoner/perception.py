@@ -112,8 +112,7 @@ class Perception:
             clip.append(frame)
             if sum(len(one["data"]) for one in clip) > IMAGE_MESSAGE_MAX_BYTES:
                 raise LimitExceeded(
-                    f"{len(clip)} of {call.frames} pictures have more than the"
-                    f" {IMAGE_MESSAGE_MAX_BYTES} bytes of a request",
+                    f"{len(clip)} pictures have more than {IMAGE_MESSAGE_MAX_BYTES} bytes",
                     hint="ask for fewer frames",
                 )
         return clip

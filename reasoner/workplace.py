@@ -73,8 +73,7 @@ class Workplace:
                 DetectorClient, arguments.detector, "detector", stack
             )
             self._vlm = await self._given(SceneVlmClient, arguments.scene_vlm, "scene-vlm", stack)
-            reward = "none" if arguments.reward is None else arguments.reward
-            self._reward = await self._given(RewardClient, reward, "reward", stack)
+            self._reward = await self._given(RewardClient, arguments.reward, "reward", stack)
             self._open = stack.pop_all()
         return self
 

@@ -42,7 +42,10 @@ def environment(requirements: Sequence[str], environ: Mapping[str, str]) -> Path
     """Return the folder of the environment, which is made where it is missing. Raises as
     `enter`."""
     folder = cache_folder(environ) / "environments"
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: {error.strerror}", hint="set XDG_CACHE_HOME") from error
     of = "\n".join([sys.version, *_own_folders(), *requirements])
     made = folder / hashlib.sha256(of.encode()).hexdigest()[:16]
     with _locked(made.with_suffix(".lock")):

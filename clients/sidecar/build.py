@@ -77,13 +77,19 @@ async def build[C: SidecarClient](
         )
     name = name or sidecar_name(manifest.name)
     client = kind(program_endpoint(name, os.environ, os.getuid()))
-    flags = ["--arbiter", arbiter] if arbiter else []
-    if arbiter == "none":
-        flags = ["--no-arbiter"]
+    command = [
+        sys.executable,
+        "-m",
+        "vram_arbiter.sidecars",
+        "--name",
+        name,
+        "--rskill",
+        str(rskill),
+    ]
+    if arbiter is not None:
+        command += ["--no-arbiter"] if arbiter == "none" else ["--arbiter", arbiter]
     if allow_noncommercial:
-        flags.append(LICENSE_FLAG)
-    command = [sys.executable, "-m", "vram_arbiter.sidecars"]
-    command += ["--name", name, "--rskill", str(rskill), *flags]
+        command.append(LICENSE_FLAG)
     async with served(client, command):
         served_id = client.identity and client.identity.get("rskill")
         if not client.of_field and served_id != manifest.name:
@@ -107,8 +113,8 @@ async def served(client: SidecarClient, command: Sequence[str]) -> AsyncIterator
             yield
             return
         child = _Child(client.endpoint, command)
+        await child.start()
         try:
-            await child.start()
             await child.answers(client)
             keeping = asyncio.create_task(child.keep(), name="sidecar")
             try:
@@ -121,13 +127,14 @@ async def served(client: SidecarClient, command: Sequence[str]) -> AsyncIterator
 
 
 class _Child:
-    """One sidecar as a child process; only this one is ever ended."""
+    """One sidecar as a child process; only this one is ever ended. First of all, `start` it."""
+
+    _process: Process
 
     def __init__(self, endpoint: str, command: Sequence[str]) -> None:
         self._endpoint = endpoint
         self._command = [*command, "--endpoint", endpoint, "--parent", str(os.getpid())]
         self._flags = shlex.join(command[3:])  # behind `python -m vram_arbiter.sidecars`
-        self._process: Process | None = None
 
     async def start(self) -> None:
         """Start it; what it prints goes to stderr. Raises SidecarUnavailable."""
@@ -144,16 +151,15 @@ class _Child:
     async def answers(self, client: SidecarClient) -> None:
         """Wait for the first answer. Raises SidecarUnavailable where the child ends before, and no
         other program's sidecar, which was faster, answers either."""
-        assert self._process is not None, "answers before start"
         ended = asyncio.create_task(self._process.wait())
         answered = asyncio.create_task(client.ping(timeout_s=BOOT_S))
         try:
             await asyncio.wait({ended, answered}, return_when=asyncio.FIRST_COMPLETED)
-            if not answered.done():
+            if answered.done():
+                answered.result()
+            else:
                 answered.cancel()
-                await asyncio.wait({answered})
-                answered = asyncio.create_task(client.ping(timeout_s=PROBE_S))
-            await answered
+                await client.ping(timeout_s=PROBE_S)
         except SidecarUnavailable as error:
             if self._process.returncode is None:
                 raise
@@ -169,23 +175,22 @@ class _Child:
     async def keep(self) -> None:
         """Start it again after each failure, unless another program's sidecar serves by then."""
         for _ in range(RESTARTS_MAX):
-            assert self._process is not None, "keep before start"
             code = await self._process.wait()
             if code in ENDED or is_listening(self._endpoint):
                 log.warning("the sidecar of %s ended with exit code %d", self._endpoint, code)
                 return
-            log.warning(
-                "the sidecar of %s ended with exit code %d and is started again",
-                self._endpoint,
-                code,
-            )
+            log.warning("the sidecar of %s failed (%d) and is started again", self._endpoint, code)
             await asyncio.sleep(RESTART_S)
-            await self.start()
+            try:
+                await self.start()
+            except SidecarUnavailable as error:
+                log.error("%s", error)
+                return
 
     async def end(self) -> None:
         """Send SIGTERM, and SIGKILL after END_S."""
         process = self._process
-        if process is None or process.returncode is not None:
+        if process.returncode is not None:
             return
         with contextlib.suppress(ProcessLookupError):
             process.terminate()

@@ -100,8 +100,8 @@ def sidecars_given(flags: list[str]) -> dict[str, str]:
     given = {}
     for flag in flags:
         name, equals, where = flag.partition("=")
-        if not equals:
-            name = load_manifest(_manifest(flag)).name
+        if not equals and (file := manifest_file(flag)) is not None:
+            name = load_manifest(file).name
             where = sidecar_endpoint(name, {}, os.environ)
         if not name or not where:
             raise ConfigError(f"--sidecar {flag} is not of the form RSKILL=ENDPOINT")
@@ -115,25 +115,11 @@ async def start_sidecars(args: argparse.Namespace, stack: contextlib.AsyncExitSt
 
     Called before signals are handled: one ends the program also while a sidecar starts.
     """
-    arbiter = "none" if args.no_arbiter else args.arbiter
-    for flag in args.sidecar:
-        if "=" not in flag:
-            await stack.enter_async_context(
-                build(
-                    _manifest(flag),
-                    SidecarClient,
-                    arbiter=arbiter,
-                    allow_noncommercial=args.allow_noncommercial,
-                )
-            )
-
-
-def _manifest(flag: str) -> Path:
-    """Return the manifest that a `--sidecar` names. Raises ConfigError for an address alone."""
-    file = manifest_file(flag)
-    if file is None:
-        raise ConfigError(f"--sidecar {flag} does not say whose it is", hint=f"RSKILL={flag}")
-    return file
+    arbiter, licensed = "none" if args.no_arbiter else args.arbiter, args.allow_noncommercial
+    for file in (manifest_file(flag) for flag in args.sidecar if "=" not in flag):
+        if file is not None:
+            started = build(file, SidecarClient, arbiter=arbiter, allow_noncommercial=licensed)
+            await stack.enter_async_context(started)
 
 
 def check_sidecars(given: Mapping[str, str], manifests: Iterable[RSkillManifest]) -> None:

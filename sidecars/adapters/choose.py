@@ -30,25 +30,22 @@ def make_adapter(manifest: RSkillManifest, weights: Weights) -> ModelAdapter:
 
     Raises ConfigError for kinds, engines and runtimes that no sidecar serves.
     """
-    engine = manifest.detector.engine if manifest.detector else None
-    if manifest.runtime in ONNX and manifest.kind is Kind.DETECTOR:
-        if engine not in (None, DetectorEngine.RTDETR_ONNX):
-            raise ConfigError(
-                f"{manifest.name}: detector engine {engine} is not served by {manifest.runtime}",
-                hint="use engine rtdetr_onnx",
-            )
-        return OnnxDetectorAdapter(manifest, weights)
-    if manifest.runtime is not Runtime.PYTORCH:
+    exported = manifest.kind is Kind.DETECTOR and manifest.runtime in ONNX
+    if manifest.runtime is not Runtime.PYTORCH and not exported:
         raise ConfigError(
             f"{manifest.name}: runtime {manifest.runtime.value!r} is not served",
             hint="sidecars run pytorch, and detectors also as onnx or tensorrt",
         )
     if manifest.kind is Kind.DETECTOR:
-        if engine not in (None, DetectorEngine.ZEROSHOT_HF):
+        engine = manifest.detector.engine if manifest.detector else None
+        served = DetectorEngine.RTDETR_ONNX if exported else DetectorEngine.ZEROSHOT_HF
+        if engine not in (None, served):
             raise ConfigError(
-                f"{manifest.name}: detector engine {engine} is not served by pytorch",
-                hint="use engine zeroshot_hf, or runtime onnx",
+                f"{manifest.name}: detector engine {engine} is not served by {manifest.runtime}",
+                hint=f"use engine {served}",
             )
+        if exported:
+            return OnnxDetectorAdapter(manifest, weights)
         loader = manifest.quantization.extra.get("loader")
         if loader == LOADER:
             return LocateAnythingAdapter(manifest, weights)

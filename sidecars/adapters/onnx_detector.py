@@ -38,6 +38,8 @@ FILES: Final[Mapping[Dtype, str]] = {
 SIZES: Final = "orig_target_sizes"
 """Input: width and height of the whole picture."""
 
+type Provider = tuple[str, dict[str, str]]
+"""Name and options."""
 type Outputs = Mapping[str, Any]
 type Found = tuple[Any, Any]
 """Scores (boxes, classes) and boxes (boxes, 4: x0, y0, x1, y1 in pixels of the whole picture)."""
@@ -67,16 +69,15 @@ class OnnxDetectorAdapter:
         self._weights = fetched(self._weights, ONNX_FILES)
         self._file = _file(Path(self._weights.source), self._manifest.quantization.dtype)
         with fitting(OnnxDetectorAdapter, self._weights):
-            session = self._open([CPU], threads=1)
+            session = self._open([(CPU, {})], threads=1)
         self._check(session)
 
     def place(self, device: str) -> None:
         wanted = providers(self._manifest, device)
         self._session = self._open(wanted)
-        first = wanted[0] if isinstance(wanted[0], str) else wanted[0][0]
-        if (got := self._session.get_providers()[0]) != first:  # it falls back with a warning
+        if (got := self._session.get_providers()[0]) != wanted[0][0]:  # it falls back and warns
             raise ModelError(
-                f"onnxruntime runs the model by {got} instead of {first}",
+                f"onnxruntime runs the model by {got} instead of {wanted[0][0]}",
                 hint="its log says which library of CUDA or TensorRT is missing",
             )
 
@@ -134,14 +135,14 @@ class OnnxDetectorAdapter:
             asked.setdefault(number, text)
         return asked
 
-    def _open(self, given: Sequence[Any], threads: int = 0) -> Any:
+    def _open(self, given: list[Provider], threads: int = 0) -> Any:
         """Return a session; `threads` 0: as many as the process may use. One makes none beside it:
         the process that reads weights is forked."""
         from vram_arbiter.sidecars.onnx_runtime import onnxruntime
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
-        return onnxruntime.InferenceSession(str(self._file), options, providers=list(given))
+        return onnxruntime.InferenceSession(str(self._file), options, providers=given)
 
     def _check(self, session: Any) -> None:
         """Raise ModelError for inputs and outputs that are of no known form."""
@@ -161,8 +162,9 @@ class OnnxDetectorAdapter:
                 )
 
 
-def providers(manifest: RSkillManifest, device: str) -> list[Any]:
-    """Return ONNX Runtime's providers for a device (`cpu`, `none`, `cuda:N`, …).
+def providers(manifest: RSkillManifest, device: str) -> list[Provider]:
+    """Return ONNX Runtime's providers for a device (`cpu`, `none`, `cuda:N`, …), the first of which
+    has to run the model.
 
     Raises ConfigError for one that this installation does not have: there is no other way.
     """
@@ -171,10 +173,11 @@ def providers(manifest: RSkillManifest, device: str) -> list[Any]:
 
     kind, _, index = device.partition(":")
     place = {"device_id": index or "0"}
-    wanted: list[Any] = [(CUDA, {**place, **CUDA_OPTIONS})] if kind == "cuda" else [CPU]
+    on_cuda = (CUDA, place | CUDA_OPTIONS)
+    wanted = [on_cuda] if kind == "cuda" else [(CPU, {})]
     if manifest.runtime is Runtime.TENSORRT:
-        wanted = [(TENSORRT, place), (CUDA, {**place, **CUDA_OPTIONS})]
-    first = wanted[0] if isinstance(wanted[0], str) else wanted[0][0]
+        wanted = [(TENSORRT, place), on_cuda]
+    first = wanted[0][0]
     has = onnxruntime.get_available_providers()
     if first not in has:
         raise ConfigError(
@@ -190,7 +193,8 @@ def _file(folder: Path, dtype: Dtype) -> Path:
     """Return the model of a folder: the only one, else that of the number format. Raises
     ModelError."""
     files = sorted(folder.rglob("*.onnx"))
-    wanted = [file for file in files if file.name == FILES.get(dtype)] if len(files) > 1 else files
+    named = [file for file in files if file.name == FILES.get(dtype)]
+    wanted = files if len(files) == 1 else named
     if len(wanted) != 1:
         names = ", ".join(str(file.relative_to(folder)) for file in files) or "none"
         raise ModelError(

@@ -114,6 +114,12 @@ def test_without_uv_the_error_names_it(index: Path, monkeypatch: pytest.MonkeyPa
         environment(TINY, os.environ)
 
 
+def test_a_cache_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"file/vram-arbiter/environments: .*set XDG_CACHE_HOME"):
+        environment(TINY, {"XDG_CACHE_HOME": str(tmp_path / "file")})
+
+
 def test_requirements_are_no_options_of_uv_and_no_skill_without_a_sidecar_has_them() -> None:
     with pytest.raises(ManifestError, match="environment"):
         parse_manifest(MANIFEST.format(name="eye") + "environment: ['--index-url=http://x']\n")

@@ -128,7 +128,7 @@ def test_wrong_flags_are_usage_errors(capsys: pytest.CaptureFixture[str]) -> Non
         (["--scene", "none.yaml"], "none.yaml"),
         (["--skills", "none"], "none"),
         (["--sidecar", "grab"], "grab: cannot be read"),
-        (["--sidecar", "ipc:///x"], "does not say whose it is (RSKILL=ipc:///x)"),
+        (["--sidecar", "ipc:///x"], "RSKILL=ENDPOINT"),
         (["--sidecar", "=ipc:///x"], "RSKILL=ENDPOINT"),
         (
             ["--sidecar", "vram-arbiter/so101-grap=ipc:///x"],
