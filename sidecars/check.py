@@ -1,7 +1,7 @@
 """`vram-sidecar --check`: what keeps a model from being served, before anything is loaded.
 
-All findings are collected, not only the first. No weights are downloaded, no GPU is used, and the model
-is built without bytes (`load("meta")`).
+All findings are collected, not only the first. No weights are downloaded, no GPU is used, and the
+model is built without bytes (`load("meta")`).
 """
 
 import contextlib
