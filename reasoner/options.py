@@ -55,12 +55,13 @@ FILES = (
         "with serve: append each finished task and its result, as lines of JSON",
     ),
 )
+SIDECAR = "ENDPOINT|MANIFEST"
 ENDPOINTS = (
-    ("--listen", "socket for operators (default: ipc://RUNTIME/reasoner.sock)"),
-    ("--runner", "the runner (default: ipc://RUNTIME/runner.sock)"),
-    ("--arbiter", 'the arbiter, which is told what model follows; "none": it is not told'),
-    ("--detector", 'the detector sidecar; "none": there is none'),
-    ("--scene-vlm", 'the scene-VLM sidecar; "none": there is none'),
+    ("--listen", "ENDPOINT", "socket for operators (default: ipc://RUNTIME/reasoner.sock)"),
+    ("--runner", "ENDPOINT", "the runner (default: ipc://RUNTIME/runner.sock)"),
+    ("--arbiter", "ENDPOINT", 'the arbiter, told what model follows; "none": it is not told'),
+    ("--detector", SIDECAR, 'the detector sidecar, or a manifest to start it; "none": no detector'),
+    ("--scene-vlm", SIDECAR, 'the scene-VLM sidecar, or a manifest to start it; "none": no VLM'),
 )
 
 
@@ -96,15 +97,16 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         parser.add_argument(flag, action="store_true", help=text)
     for flag, metavar, text in FILES:
         parser.add_argument(flag, type=Path, metavar=metavar, help=text)
-    for flag, text in ENDPOINTS:
-        parser.add_argument(flag, metavar="ENDPOINT", help=text)
+    for flag, metavar, text in ENDPOINTS:
+        parser.add_argument(flag, metavar=metavar, help=text)
     parser.add_argument(
         "--reward",
         nargs="?",
         const="",
-        metavar="ENDPOINT",
-        help="use a reward model to judge progress (default endpoint: ipc://RUNTIME/reward.sock);"
-        " without this flag there is none",
+        default="none",
+        metavar=SIDECAR,
+        help="use a reward model to judge progress (default endpoint: ipc://RUNTIME/reward.sock),"
+        " or start it from a manifest; without this flag there is none",
     )
     parser.add_argument(
         "--reward-camera", default="wrist", help="camera of the reward model (default: %(default)s)"

@@ -2,10 +2,12 @@
 says about it.
 """
 
+import asyncio
 import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from time import monotonic
+from typing import Any
 
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
@@ -14,7 +16,8 @@ from vram_arbiter.reasoner.history import Past, Taken
 from vram_arbiter.reasoner.outcomes import of_detections, of_judgement
 from vram_arbiter.reasoner.palette import Palette
 from vram_arbiter.reasoner.planner import Outcome
-from vram_arbiter.schemas.errors import FrameStale, NotPermitted
+from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES
+from vram_arbiter.schemas.errors import FrameStale, LimitExceeded, NotPermitted
 from vram_arbiter.schemas.goals import FrameReply
 from vram_arbiter.schemas.tools import LocateInView, Look, QueryScene, QueryTaskProgress
 
@@ -72,15 +75,47 @@ class Perception:
 
     async def query(self, call: QueryScene) -> Outcome:
         vlm = _provided(self.scene_vlm, "scene VLM")
-        frame, answer = await self._ask(
+        clip, answer = await self._ask(
             vlm,
-            lambda: self._frame(call.camera),
-            lambda frame: vlm.query(
-                frame["data"], call.question, fresh_s=_good_for_s(frame["age_ms"])
+            lambda: self._clip(call),
+            lambda clip: vlm.query(
+                **_pictures(clip),
+                question=call.question,
+                fresh_s=_good_for_s(clip[-1]["age_ms"]),
             ),
         )
-        about = {"camera": frame["camera"], "question": call.question}
+        about = {"camera": clip[-1]["camera"], "question": call.question}
         return Outcome("answered", answer, data=about)
+
+    async def _clip(self, call: QueryScene) -> list[FrameReply]:
+        """Return the present picture, or the clip that the call asks for, oldest first.
+
+        Raises FrameStale where the camera gives no new picture for each, LimitExceeded for more
+        bytes than a request may have.
+        """
+        if call.frames == 1:
+            return [await self._frame(call.camera)]
+        apart_s = call.seconds / (call.frames - 1)
+        clip: list[FrameReply] = []
+        begun_s = monotonic()
+        for number in range(call.frames):
+            await asyncio.sleep(begun_s + number * apart_s - monotonic())
+            # pictures of a clip are looked at together, and PNG would be too many bytes
+            frame = await self.runner.frame(
+                call.camera, max_age_ms=min(FRAME_MAX_AGE_MS, apart_s * 1e3), encoding="jpeg"
+            )
+            if clip and frame["stamp_monotonic_ns"] <= clip[-1]["stamp_monotonic_ns"]:
+                raise FrameStale(
+                    f"camera {frame['camera']} gives no new picture every {apart_s:g} s",
+                    hint="ask for fewer frames, or for more seconds",
+                )
+            clip.append(frame)
+            if sum(len(one["data"]) for one in clip) > IMAGE_MESSAGE_MAX_BYTES:
+                raise LimitExceeded(
+                    f"{len(clip)} pictures have more than {IMAGE_MESSAGE_MAX_BYTES} bytes",
+                    hint="ask for fewer frames",
+                )
+        return clip
 
     async def show(self, call: Look) -> Outcome:
         frame = await self.runner.frame(call.camera, max_age_ms=FRAME_MAX_AGE_MS, encoding="jpeg")
@@ -143,6 +178,15 @@ async def need_permitted(sidecar: SidecarClient, palette: Palette | None) -> Non
     identity = sidecar.identity or await sidecar.ping(timeout_s=IDENTITY_S)
     if (error := palette.permits(str(identity.get("rskill", "")))) is not None:
         raise error
+
+
+def _pictures(clip: Sequence[FrameReply]) -> dict[str, Any]:
+    """Return one picture as such, several as a video with its rate."""
+    images = [frame["data"] for frame in clip]
+    if len(images) == 1:
+        return {"image_png": images[0]}
+    first, last = clip[0]["stamp_monotonic_ns"], clip[-1]["stamp_monotonic_ns"]
+    return {"video": images, "fps": (len(images) - 1) * 1e9 / (last - first)}
 
 
 async def _look[P, A](

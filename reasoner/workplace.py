@@ -8,6 +8,7 @@ from typing import Self
 
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
+from vram_arbiter.clients.sidecar.build import build, manifest_file
 from vram_arbiter.clients.sidecar.perception import DetectorClient, RewardClient, SceneVlmClient
 from vram_arbiter.reasoner.confirm import Confirmations
 from vram_arbiter.reasoner.hints import Hints
@@ -53,22 +54,31 @@ class Workplace:
         self._runner, self._watching, self._eyes = (RunnerClient(at) for _ in range(3))
         arbiter = arguments.arbiter or arbiter_endpoint(os.environ, os.getuid())
         self._hints = None if arbiter == "none" else Hints(arbiter)
-        self._detector = _given(DetectorClient, arguments.detector, "detector")
-        self._vlm = _given(SceneVlmClient, arguments.scene_vlm, "scene-vlm")
-        reward = "none" if arguments.reward is None else arguments.reward
-        self._reward = _given(RewardClient, reward, "reward")
+        self._detector: DetectorClient | None = None
+        self._vlm: SceneVlmClient | None = None
+        self._reward: RewardClient | None = None
+        self._open = contextlib.AsyncExitStack()
         self.busy = False
         """Whether an episode runs: its inbox takes a cancel."""
 
     async def __aenter__(self) -> Self:
+        """Start the sidecars that are given as manifests and not served. Raises what `build`
+        raises."""
+        arguments = self._arguments
+        async with contextlib.AsyncExitStack() as stack:
+            stack.callback(self._transcript.close)
+            for client in (self._runner, self._watching, self._eyes):
+                stack.push_async_callback(client.close)
+            self._detector = await self._given(
+                DetectorClient, arguments.detector, "detector", stack
+            )
+            self._vlm = await self._given(SceneVlmClient, arguments.scene_vlm, "scene-vlm", stack)
+            self._reward = await self._given(RewardClient, arguments.reward, "reward", stack)
+            self._open = stack.pop_all()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        sidecars = (self._detector, self._vlm, self._reward)
-        for client in (*sidecars, self._runner, self._watching, self._eyes):
-            if client is not None:
-                await client.close()
-        self._transcript.close()
+        await self._open.aclose()
 
     async def perform(self, task: str, inbox: Inbox) -> Result:
         """Perform one task to its end.
@@ -132,6 +142,28 @@ class Workplace:
             result["llm"] = planner.tally.as_result(planner.config.model)
         return result
 
+    async def _given[C: SidecarClient](
+        self, kind: type[C], given: str | None, name: str, stack: contextlib.AsyncExitStack
+    ) -> C | None:
+        """Return the client of a sidecar, given as endpoint or manifest; None for "none"."""
+        if given == "none":
+            return None
+        file = manifest_file(given) if given else None
+        if file is None:
+            client = kind(endpoint(given, name))
+            stack.push_async_callback(client.close)
+            return client
+        arbiter = self._arguments.arbiter
+        return await stack.enter_async_context(
+            build(
+                file,
+                kind,
+                name=name,
+                arbiter=None if arbiter == "none" else arbiter,  # without hints, not without leases
+                allow_noncommercial=self._arguments.allow_noncommercial,
+            )
+        )
+
     def _judge(
         self, task: str, manifests: list[RSkillManifest], stack: contextlib.AsyncExitStack
     ) -> Judge | None:
@@ -161,10 +193,6 @@ class Workplace:
         procedure = self._playbook.procedure if self._playbook is not None else ""
         planner = kind(self._llm, palette, procedure=procedure, transcript=self._transcript)
         return await stack.enter_async_context(planner)
-
-
-def _given[C: SidecarClient](kind: type[C], given: str | None, name: str) -> C | None:
-    return None if given == "none" else kind(endpoint(given, name))
 
 
 def _steps_max(playbook: Playbook | None) -> int:

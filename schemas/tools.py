@@ -33,6 +33,7 @@ from vram_arbiter.schemas.errors import BadRequest, UnknownOp
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
 
 PROGRESS_WINDOW_MAX_S = 60.0
+CLIP_FRAMES_MAX, CLIP_MAX_S = 16, 10.0  # of one question to a scene VLM
 TOOL_NAME_MAX_CHARS = 64  # what the public chat APIs accept
 
 Text = Annotated[str, Field(max_length=4096)]
@@ -107,12 +108,17 @@ class LocateInView(_Tool):
 
 
 class QueryScene(_Tool):
-    """Ask a question about a camera's present picture and get a sentence back. Moves nothing."""
+    """Ask a question about a camera's present picture, or a short clip, and get a sentence back.
+    Moves nothing."""
 
     tool: Literal["query_scene"] = "query_scene"
     question: Words
     """A question that the picture can answer."""
     camera: Camera = ""
+    frames: Annotated[int, Field(ge=1, le=CLIP_FRAMES_MAX)] = 1
+    """Number of pictures; several are a clip that begins now, for questions about what changes."""
+    seconds: Annotated[float, Field(gt=0, le=CLIP_MAX_S)] = 2.0
+    """Length of the clip."""
 
 
 class Look(_Tool):

@@ -20,17 +20,25 @@ from vram_arbiter.clients.net.server import path_of
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import ConfigError, VramError
 from vram_arbiter.schemas.fakegpu import FOLDER_VARIABLE
-from vram_arbiter.schemas.manifest import LICENSE_FLAG, LICENSE_HELP, ManifestError, RSkillManifest
+from vram_arbiter.schemas.manifest import (
+    LICENSE_FLAG,
+    LICENSE_HELP,
+    ManifestError,
+    RSkillManifest,
+    load_manifest,
+)
 from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint, program_endpoint
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry.commands import command
 from vram_arbiter.schemas.runtime.version import add_version
+from vram_arbiter.sidecars import environment
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.gpu_passthrough import need_gpu
 from vram_arbiter.sidecars.check import Wanted, check, need_packages, need_precision, report
 from vram_arbiter.sidecars.model_main import AdapterFor
+from vram_arbiter.sidecars.parent import end_with
 from vram_arbiter.sidecars.replaced import replaced
 from vram_arbiter.sidecars.settings import (
     NICE,
@@ -58,6 +66,8 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
     `adapter_for` lets a program serve a model of its own.
     """
     flags = parser().parse_args(arguments)
+    if flags.parent is not None:
+        end_with(flags.parent)
     # one service per model, so that a trace shows which one it was
     service = f"vram-sidecar-{flags.name}"
     human = f"%(asctime)s {flags.name} %(levelname)s %(message)s"
@@ -66,6 +76,9 @@ def main(arguments: list[str] | None = None, adapter_for: AdapterFor = make_adap
     try:
         for name, value in ENVIRONMENT.items():
             os.environ.setdefault(name, value)
+        if adapter_for is make_adapter:
+            file = shipped(flags.rskill, "rskills", flags.configs or configs_folder(os.environ))
+            environment.enter(load_manifest(file).environment, arguments or sys.argv[1:])
         if flags.check:
             return report(check(wanted_from(flags, adapter_for)), as_json=flags.as_json)
         settings = settings_from(flags)
@@ -263,6 +276,7 @@ def parser() -> argparse.ArgumentParser:
         default=NICE,
         help="nice value of the process that loads and runs the model; default %(default)s",
     )
+    add("--parent", type=int, metavar="PID", help="end with this process, which starts the sidecar")
     add("--log-level", choices=("debug", "info", "warning", "error"), default="info")
     add("--log-format", choices=logs.FORMS, default="human", help="json: one object a line")
     add(

@@ -1,7 +1,7 @@
 """`vram-sidecar --check`: what keeps a model from being served, before anything is loaded.
 
-All findings are collected, not only the first. Nothing is downloaded, no GPU is used, and the model
-is built without bytes (`load("meta")`).
+All findings are collected, not only the first. No weights are downloaded, no GPU is used, and the
+model is built without bytes (`load("meta")`).
 """
 
 import contextlib
@@ -20,7 +20,9 @@ from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
 from vram_arbiter.sidecars.adapters import policy_families
 from vram_arbiter.sidecars.adapters.base import ModelAdapter
+from vram_arbiter.sidecars.adapters.choose import ONNX
 from vram_arbiter.sidecars.adapters.gpu_passthrough import is_passthrough, need_gpu
+from vram_arbiter.sidecars.adapters.onnx_detector import providers
 from vram_arbiter.sidecars.device.capacity import capacities
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.quantization import check_precision
@@ -126,7 +128,9 @@ def _license(manifest: RSkillManifest, allow_noncommercial: bool) -> Finding:
 
 def need_packages(manifest: RSkillManifest) -> None:
     """Raise ConfigError where the model's libraries are not installed."""
-    if not is_passthrough(manifest):
+    if manifest.runtime in ONNX:
+        need(f"runtime {manifest.runtime.value}", "onnxruntime", "PIL", extra="onnx")
+    elif not is_passthrough(manifest):
         lerobot = manifest.kind in (Kind.VLA, Kind.REWARD)
         library = "lerobot" if lerobot else "transformers"
         need(f"a model of kind {manifest.kind}", "torch", library, extra="sidecars")
@@ -134,8 +138,11 @@ def need_packages(manifest: RSkillManifest) -> None:
 
 
 def need_precision(manifest: RSkillManifest, device: str) -> None:
-    """Raise UnsupportedQuantization where the model cannot be run in its number format."""
-    if not is_passthrough(manifest):
+    """Raise UnsupportedQuantization where the model cannot be run in its number format, ConfigError
+    where ONNX Runtime cannot run it on the device."""
+    if manifest.runtime in ONNX:
+        providers(manifest, device)
+    elif not is_passthrough(manifest):
         check_precision(manifest, device)
 
 

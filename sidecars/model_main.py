@@ -41,6 +41,7 @@ type AdapterFor = Callable[[RSkillManifest, Weights], ModelAdapter]
 """Makes a model's adapter; a function of a module, so that a process can be told its name."""
 
 LENGTH: Final = struct.Struct(">I")
+ONNX_FULL: Final = "Failed to allocate memory for requested buffer"
 THREADS_VARIABLE: Final = "OMP_NUM_THREADS"
 
 
@@ -231,8 +232,8 @@ def _send(stream: io.BufferedRWPair, message: Message) -> None:
 def _typed(error: BaseException) -> VramError:
     if isinstance(error, VramError):
         return error
-    # torch's class; importing torch to compare it would cost seconds
-    if type(error).__name__ == "OutOfMemoryError":
+    # torch's class; importing torch to compare it would cost seconds. onnxruntime has no class
+    if type(error).__name__ == "OutOfMemoryError" or ONNX_FULL in str(error):
         return OutOfMemory(str(error), hint=REMEASURE)
     if isinstance(error, ImportError):
         return ModelError(str(error), hint="pip install 'vram-arbiter[sidecars]'")

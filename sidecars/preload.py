@@ -5,18 +5,14 @@ for the whole group (Ctrl-C, systemd's SIGTERM): it ends with the sidecar's host
 imports, and the host ends the models, each at its safe point.
 """
 
-import ctypes
 import os
 import signal
 
 import vram_arbiter.sidecars.model_main  # noqa: F401  reason: for every model process
+from vram_arbiter.sidecars.parent import end_with
 from vram_arbiter.sidecars.settings import HOST_VARIABLE, NICE_VARIABLE
 
-PR_SET_PDEATHSIG = 1
-
-ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-if os.getppid() != int(os.environ.get(HOST_VARIABLE, os.getppid())):
-    os._exit(1)  # the host ended before the call above
+end_with(int(os.environ.get(HOST_VARIABLE, os.getppid())))
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
 # imports take all cores for seconds, beside a robot's control loop
 os.setpriority(

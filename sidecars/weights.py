@@ -6,7 +6,7 @@ Must not know devices' bytes or leases.
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +22,7 @@ from vram_arbiter.sidecars.quantization import check_checkpoint, nf4_of, torch_t
 CONFIG_FILE: Final = "config.json"
 POLICY_FILES: Final = ["*.json", "*.safetensors", "*.model", "*.txt"]
 """What a policy's repository holds of use: weights, processors, tokenizers."""
+ONNX_FILES: Final = ["*.onnx", "*.onnx_data", "*.onnx.data"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,25 +127,26 @@ def transformers_modules(weights: Weights) -> tuple[str, ...]:
     return ("torch", "transformers", "PIL.Image", f"transformers.models.{kind}.modeling_{kind}")
 
 
-def fetched(weights: Weights) -> Weights:
+def fetched(weights: Weights, patterns: Sequence[str] = POLICY_FILES) -> Weights:
     """Return the local folder of weights and processors, after downloading what is not here.
+    `patterns`: the files of use.
 
     Some of lerobot's loaders drop the revision and read the newest one. Raises ModelError.
     """
     if not weights.local:
-        weights = _in_folder(weights, _download(weights.source, weights.revision))
+        weights = _in_folder(weights, _download(weights.source, weights.revision, patterns))
     files = weights.processors
     if files and not Path(files.source).is_dir():
-        folder = _download(files.source, files.revision)
+        folder = _download(files.source, files.revision, patterns)
         weights = replace(weights, processors=replace(files, source=folder, revision=None))
     return weights
 
 
-def _download(source: str, revision: str | None) -> str:
+def _download(source: str, revision: str | None, patterns: Sequence[str]) -> str:
     from huggingface_hub import snapshot_download
 
     try:
-        return str(snapshot_download(source, revision=revision, allow_patterns=POLICY_FILES))
+        return str(snapshot_download(source, revision=revision, allow_patterns=list(patterns)))
     except Exception as error:
         raise ModelError(
             f"{source} cannot be fetched: {type(error).__name__}: {error}",
@@ -171,7 +173,8 @@ def cached(weights: Weights) -> Weights | None:
         )
     except LocalEntryNotFoundError:
         return None
-    return _in_folder(weights, str(folder)) if any(folder.glob("*.safetensors")) else None
+    there = (*folder.glob("*.safetensors"), *folder.rglob("*.onnx"))
+    return _in_folder(weights, str(folder)) if there else None
 
 
 def from_pretrained(cls: Any, weights: Weights, **options: Any) -> Any:

@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from vram_arbiter.clients.sidecar.base import SidecarClient
-from vram_arbiter.clients.sidecar.perception import DetectorClient, RewardClient, SceneVlmClient
-from vram_arbiter.clients.sidecar.policy import PolicyClient
-from vram_arbiter.schemas.errors import SidecarUnavailable, VramError
+from vram_arbiter.clients.sidecar.build import CLIENTS, served
+from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest, load_manifest
 from vram_arbiter.schemas.manifest.vocabulary import Modality
 from vram_arbiter.schemas.plain import Message
@@ -47,37 +46,26 @@ class Plan:
 
 async def run(plan: Plan) -> dict[str, float]:
     """Return the marks. Raises the sidecar's typed errors, SidecarUnavailable where it ends."""
+    manifest = load_manifest(Path(plan.rskill))
     with tempfile.TemporaryDirectory(prefix="vc") as folder:
         endpoint = f"ipc://{folder}/calibrate.sock"
-        process = await asyncio.create_subprocess_exec(*plan.sidecar, "--endpoint", endpoint)
-        working = asyncio.create_task(_work(plan, endpoint))
-        try:
-            ended = asyncio.create_task(process.wait())
-            await asyncio.wait({working, ended}, return_when=asyncio.FIRST_COMPLETED)
-            if not working.done():
-                raise SidecarUnavailable(f"the sidecar ended with exit code {process.returncode}")
-            return working.result()
-        finally:
-            working.cancel()
-            if process.returncode is None:
-                process.terminate()
-            await process.wait()
+        client = CLIENTS[manifest.kind](endpoint, timeout_s=LOAD_S, connect_timeout_s=LOAD_S)
+        async with served(client, plan.sidecar):
+            return await _work(plan, client, manifest)
 
 
-async def _work(plan: Plan, endpoint: str) -> dict[str, float]:
-    manifest, marks = load_manifest(Path(plan.rskill)), {"requests": float(plan.requests)}
-    kind, ask = ASKED[manifest.kind]
-    async with kind(endpoint, timeout_s=LOAD_S, connect_timeout_s=LOAD_S) as client:
-        await client.load()
-        await asyncio.sleep(plan.rest_s)
-        marks["asked"] = time.monotonic()
-        for _ in range(plan.requests):
-            await ask(client, manifest)
-        await asyncio.sleep(0.1)  # a reading after the last answer
-        marks["answered"] = time.monotonic()
-        await client.unload()
-        await asyncio.sleep(plan.rest_s)
-        marks["unloaded"] = time.monotonic()
+async def _work(plan: Plan, client: SidecarClient, manifest: RSkillManifest) -> dict[str, float]:
+    marks = {"requests": float(plan.requests)}
+    await client.load()
+    await asyncio.sleep(plan.rest_s)
+    marks["asked"] = time.monotonic()
+    for _ in range(plan.requests):
+        await ASKED[manifest.kind](client, manifest)
+    await asyncio.sleep(0.1)  # a reading after the last answer
+    marks["answered"] = time.monotonic()
+    await client.unload()
+    await asyncio.sleep(plan.rest_s)
+    marks["unloaded"] = time.monotonic()
     return marks
 
 
@@ -111,21 +99,17 @@ def noise_png(side: int = SIDE) -> bytes:
     return picture.getvalue()
 
 
-ASKED: Final[dict[Kind, tuple[type[SidecarClient], Ask]]] = {
-    Kind.DETECTOR: (
-        DetectorClient,
-        lambda client, manifest: client.detect(
-            noise_png(), ", ".join(manifest.detector.labels if manifest.detector else ()) or "cup"
-        ),
+ASKED: Final[dict[Kind, Ask]] = {
+    Kind.DETECTOR: lambda client, manifest: client.detect(
+        noise_png(), ", ".join(manifest.detector.labels if manifest.detector else ()) or "cup"
     ),
-    Kind.VLM: (SceneVlmClient, lambda client, manifest: client.query(noise_png(), "Describe it.")),
-    Kind.REWARD: (
-        RewardClient,
-        lambda client, manifest: client.score([noise_png()] * REWARD_PICTURES, task_of(manifest)),
+    Kind.VLM: lambda client, manifest: client.query(noise_png(), "Describe it."),
+    Kind.REWARD: lambda client, manifest: client.score(
+        [noise_png()] * REWARD_PICTURES, task_of(manifest)
     ),
-    Kind.VLA: (PolicyClient, lambda client, manifest: client.get_action(observation_of(manifest))),
+    Kind.VLA: lambda client, manifest: client.get_action(observation_of(manifest)),
 }
-"""The client of a kind's sidecar, and one request with noise and the manifest's words."""
+"""One request to a kind's sidecar, with noise and the manifest's words."""
 
 
 def main() -> int:

@@ -26,6 +26,7 @@ from vram_arbiter.runner.cli.common import (
     install_signals,
     lease_rendering,
     sidecars_given,
+    start_sidecars,
     unlicensed,
     warm_up,
 )
@@ -136,6 +137,7 @@ async def run(args: argparse.Namespace) -> int:
         if args.videos:
             check_output("--out", args.out / "videos" / "any")
         need("a benchmark", "numpy", "cv2", extra="runner")  # behind what is wrong with the flags
+        await start_sidecars(args, stack)
         await asyncio.to_thread(warm_up)
         stopping = asyncio.Event()
         install_signals(stopping)

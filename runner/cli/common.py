@@ -16,12 +16,20 @@ from typing import TYPE_CHECKING, Any
 from vram_arbiter.clients.cli.arguments import at_least
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.net.server import check_free
+from vram_arbiter.clients.sidecar.base import SidecarClient
+from vram_arbiter.clients.sidecar.build import build, manifest_file
 from vram_arbiter.runner.cli.numbers import positive
-from vram_arbiter.runner.goals.catalogue import EXECUTABLE
+from vram_arbiter.runner.goals.catalogue import EXECUTABLE, sidecar_endpoint
 from vram_arbiter.runner.sensors.pictures import encode
 from vram_arbiter.schemas import estop
 from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
-from vram_arbiter.schemas.manifest import LICENSE_FLAG, LICENSE_HELP, Kind, RSkillManifest
+from vram_arbiter.schemas.manifest import (
+    LICENSE_FLAG,
+    LICENSE_HELP,
+    Kind,
+    RSkillManifest,
+    load_manifest,
+)
 
 if TYPE_CHECKING:
     from vram_arbiter.runner.goals.server import GoalServer
@@ -64,8 +72,9 @@ def add_skill_flags(parser: argparse.ArgumentParser) -> None:
         "--no-arbiter", action="store_true", help="run without an arbiter and leases"
     )
     parser.add_argument(
-        "--sidecar", action="append", default=[], metavar="RSKILL=ENDPOINT",
-        help="address of a policy's sidecar; default ipc://RUNTIME/NAME.sock,"
+        "--sidecar", action="append", default=[], metavar="MANIFEST|RSKILL=ENDPOINT",
+        help="a manifest to start the sidecar from (file, folder or shipped skill), or a skill's"
+        " name and the address of its sidecar; default address ipc://RUNTIME/NAME.sock,"
         " where NAME is the part of the skill's name after the first -",
     )  # fmt: skip
     add_license_flag(parser)
@@ -87,13 +96,30 @@ def add_serving_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def sidecars_given(flags: list[str]) -> dict[str, str]:
-    """`RSKILL=ENDPOINT` flags as a map. Raises ConfigError."""
-    pairs = [flag.partition("=") for flag in flags]
-    if wrong := [
-        flag for flag, (name, _, where) in zip(flags, pairs, strict=True) if not name or not where
-    ]:
-        raise ConfigError(f"--sidecar {wrong[0]} is not of the form RSKILL=ENDPOINT")
-    return {name: where for name, _, where in pairs}
+    """`--sidecar` as a map from skills to addresses. Raises ConfigError, ManifestError."""
+    given = {}
+    for flag in flags:
+        name, equals, where = flag.partition("=")
+        if not equals and (file := manifest_file(flag)) is not None:
+            name = load_manifest(file).name
+            where = sidecar_endpoint(name, {}, os.environ)
+        if not name or not where:
+            raise ConfigError(f"--sidecar {flag} is not of the form RSKILL=ENDPOINT")
+        given[name] = where
+    return given
+
+
+async def start_sidecars(args: argparse.Namespace, stack: contextlib.AsyncExitStack) -> None:
+    """Start the sidecars that are given as manifests and not served, until the stack ends. Raises
+    what `build` raises.
+
+    Called before signals are handled: one ends the program also while a sidecar starts.
+    """
+    arbiter, licensed = "none" if args.no_arbiter else args.arbiter, args.allow_noncommercial
+    for file in (manifest_file(flag) for flag in args.sidecar if "=" not in flag):
+        if file is not None:
+            started = build(file, SidecarClient, arbiter=arbiter, allow_noncommercial=licensed)
+            await stack.enter_async_context(started)
 
 
 def check_sidecars(given: Mapping[str, str], manifests: Iterable[RSkillManifest]) -> None:

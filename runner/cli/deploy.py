@@ -29,6 +29,7 @@ from vram_arbiter.runner.cli.common import (
     install_signals,
     serve_for,
     sidecars_given,
+    start_sidecars,
 )
 from vram_arbiter.runner.cli.deployment import (
     DeploymentFile,
@@ -141,9 +142,10 @@ class Deploy:
             return 0
         for text in (*unkept(self._file, parts, check), *unused(self._file.robot)):
             log.warning("%s is not kept", text)
-        install_signals(self._stopping)
         async with contextlib.AsyncExitStack() as stack:
             claim(self._file.robot, stack)
+            await start_sidecars(self._args, stack)
+            install_signals(self._stopping)
             mark = EstopMark(_robot_file("robot", self._file.robot.robot_id, "estop"))
             mark.refuse_if_left()
             arbiter = (

@@ -26,6 +26,7 @@ from vram_arbiter.runner.cli.common import (
     lease_rendering,
     serve_for,
     sidecars_given,
+    start_sidecars,
     unlicensed,
     warm_up,
 )
@@ -104,6 +105,7 @@ async def run(args: argparse.Namespace) -> int:
     clock = SystemClock()
     stopping = asyncio.Event()
     async with contextlib.AsyncExitStack() as stack:
+        await start_sidecars(args, stack)
         arbiter = None
         if not args.no_arbiter:
             arbiter = await connect_arbiter(args.arbiter, stack)

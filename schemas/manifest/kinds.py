@@ -27,6 +27,7 @@ image_preprocessing -    -    F          F           -        F         F    F  
 reward_rskill_name  -    F    F          F           F        F         F    F      F
 min_vram_gb         -    -    -          -           -        -         -    -      F
 envelope            -    -    -          -           -        -         -    -      F
+environment         -    -    F          F           -        -         -    -      F
 actuators_required  R    -    R          R           F        F         F    F      F
 chunk_size          -    -    =1         =1          -        -         -    -      =1
 role                -    -    -          -           -        -         -    -      =s2

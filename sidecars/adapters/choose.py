@@ -10,11 +10,14 @@ from vram_arbiter.sidecars.adapters.base import ModelAdapter
 from vram_arbiter.sidecars.adapters.detector import ZERO_SHOT_LOADER, DetectorAdapter
 from vram_arbiter.sidecars.adapters.gpu_passthrough import GpuPassthroughAdapter, is_passthrough
 from vram_arbiter.sidecars.adapters.locate_anything import LOADER, LocateAnythingAdapter
+from vram_arbiter.sidecars.adapters.onnx_detector import OnnxDetectorAdapter
 from vram_arbiter.sidecars.adapters.policy import PolicyAdapter
 from vram_arbiter.sidecars.adapters.reward import RewardAdapter
 from vram_arbiter.sidecars.adapters.scene_vlm import SceneVlmAdapter
 from vram_arbiter.sidecars.weights import Weights
 
+ONNX: Final = frozenset({Runtime.ONNX, Runtime.TENSORRT})
+"""Runtimes of exported models."""
 _ADAPTERS: Final[Mapping[Kind, Callable[[RSkillManifest, Weights], ModelAdapter]]] = {
     Kind.VLM: SceneVlmAdapter,
     Kind.VLA: PolicyAdapter,
@@ -27,18 +30,22 @@ def make_adapter(manifest: RSkillManifest, weights: Weights) -> ModelAdapter:
 
     Raises ConfigError for kinds, engines and runtimes that no sidecar serves.
     """
-    if manifest.runtime is not Runtime.PYTORCH:
+    exported = manifest.kind is Kind.DETECTOR and manifest.runtime in ONNX
+    if manifest.runtime is not Runtime.PYTORCH and not exported:
         raise ConfigError(
             f"{manifest.name}: runtime {manifest.runtime.value!r} is not served",
-            hint="sidecars run pytorch",
+            hint="sidecars run pytorch, and detectors also as onnx or tensorrt",
         )
     if manifest.kind is Kind.DETECTOR:
         engine = manifest.detector.engine if manifest.detector else None
-        if engine not in (None, DetectorEngine.ZEROSHOT_HF):
+        served = DetectorEngine.RTDETR_ONNX if exported else DetectorEngine.ZEROSHOT_HF
+        if engine not in (None, served):
             raise ConfigError(
-                f"{manifest.name}: detector engine {engine} is not served",
-                hint="use engine zeroshot_hf",
+                f"{manifest.name}: detector engine {engine} is not served by {manifest.runtime}",
+                hint=f"use engine {served}",
             )
+        if exported:
+            return OnnxDetectorAdapter(manifest, weights)
         loader = manifest.quantization.extra.get("loader")
         if loader == LOADER:
             return LocateAnythingAdapter(manifest, weights)

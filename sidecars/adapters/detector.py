@@ -80,12 +80,7 @@ class DetectorAdapter(OneNetwork):
             self._contract.score_threshold if call.score_threshold is None else call.score_threshold
         )
         found = self._detect(shrunk, labels, threshold, (height, width))
-        return {
-            "ok": True,
-            "answer": grounding_answer(found, width, height),
-            "norm": NORM,
-            "detections": found,
-        }
+        return detected(found, picture.size)
 
     def _detect(
         self, picture: Any, labels: list[str], threshold: float, size: tuple[int, int]
@@ -124,11 +119,11 @@ class DetectorAdapter(OneNetwork):
             else _grounded(outputs, spans, labels, size)
         )
         found = [
-            _detection(name, score, box, size)
+            detection(name, score, box, size)
             for score, name, box in zip(scores, names, boxes, strict=True)
             if score > threshold
         ]
-        return sorted((one for one in found if one is not None), key=lambda one: -one["score"])
+        return [one for one in found if one is not None]
 
     def _refuse_long(self, labels: list[str]) -> None:
         """Raise BadRequest for a text that the model would read only in part."""
@@ -243,6 +238,13 @@ def split_query(query: str | Sequence[str]) -> list[str]:
     return labels
 
 
+def detected(found: list[DetectionResult], size: tuple[int, int]) -> Message:
+    """Return the reply to `detect`, best first, for a picture of this width and height."""
+    best = sorted(found, key=lambda one: -one["score"])
+    answer = grounding_answer(best, *size)
+    return {"ok": True, "answer": answer, "norm": NORM, "detections": best}
+
+
 def grounding_answer(found: list[DetectionResult], width: int, height: int) -> str:
     """Return the field's format, in thousandths: `<ref>label</ref><box><x1><y1><x2><y2></box>`
     each."""
@@ -255,10 +257,10 @@ def grounding_answer(found: list[DetectionResult], width: int, height: int) -> s
     return "".join(parts)
 
 
-def _detection(
+def detection(
     label: str, score: float, box: list[float], size: tuple[int, int]
 ) -> DetectionResult | None:
-    """Clip a box to the picture; None if nothing is left of it.
+    """Clip a box to the picture (`size`: height, width); None if nothing is left of it.
 
     Raises ModelError for values that are not numbers: clipping would put the picture's edge there.
     """

@@ -43,6 +43,9 @@ class Runner:
         self.skills: list[dict[str, Any]] = []
         self.diagnostics: dict[str, str] = {}
         self.frame_error: VramError | None = None
+        self.frames: list[GetFrame] = []
+        self.frame_data = PNG
+        self.stamp_step_ns = 1
         self.camera_model: dict[str, Any] | None = None
         self.ends_on_cancel = True
         self.result_error: VramError | None = None
@@ -113,16 +116,17 @@ class Runner:
                     raise BadRequest(f"there is no goal {goal_id}")
                 return {"goal_id": goal_id}
             case GetFrame():
+                self.frames.append(request)
                 if self.frame_error is not None:
                     raise self.frame_error
                 model = {} if self.camera_model is None else {"camera_model": self.camera_model}
                 return {
                     "camera": request.camera or "front",
                     "encoding": "png",
-                    "data": PNG,
+                    "data": self.frame_data,
                     "width": 4,
                     "height": 4,
-                    "stamp_monotonic_ns": 1,
+                    "stamp_monotonic_ns": 1 + len(self.frames) * self.stamp_step_ns,
                     "age_ms": 1.0,
                     **model,
                 }

@@ -6,11 +6,11 @@ import pytest
 
 from tests.support.field_server import PNG
 from vram_arbiter.clients.runner import RunnerClient
-from vram_arbiter.clients.sidecar.perception import DetectorClient
+from vram_arbiter.clients.sidecar.perception import DetectorClient, SceneVlmClient
 from vram_arbiter.reasoner.palette import Palette, Skill
 from vram_arbiter.reasoner.tools import Tools
 from vram_arbiter.schemas.errors import FrameStale
-from vram_arbiter.schemas.tools import LocateInView, Look
+from vram_arbiter.schemas.tools import LocateInView, Look, QueryScene
 
 pytestmark = pytest.mark.anyio
 
@@ -49,3 +49,42 @@ async def test_a_picture_for_the_planner_itself(runner: Any, client: RunnerClien
     assert shown.picture == PNG
     assert "wrist" in shown.text
     assert none.picture == b""
+
+
+async def test_a_clip_is_a_video_of_new_pictures(
+    runner: Any, client: RunnerClient, a_sidecar: Any
+) -> None:
+    """Its rate is that of the pictures' stamps, not what was asked for."""
+    runner.stamp_step_ns = 200_000_000
+    async with a_sidecar("lab/vlm") as sidecar, SceneVlmClient(sidecar.endpoint) as vlm:
+        tools = Tools(client, None, vlm)
+        ask = QueryScene(question="Does it move?", camera="wrist", frames=3, seconds=0.02)
+        outcome = await tools(ask)
+        assert (outcome.status, outcome.data["camera"]) == ("answered", "wrist")
+        (asked,) = [message for message in sidecar.messages if message["op"] == "query"]
+        assert (asked["video"], asked["fps"]) == ([PNG] * 3, 5.0)
+        assert "image" not in asked
+        assert 0 < asked["fresh_s"] <= 5.0
+        wanted = [(frame.max_age_ms, frame.encoding, frame.camera) for frame in runner.frames]
+        assert wanted == [(10.0, "jpeg", "wrist")] * 3
+
+
+@pytest.mark.parametrize(
+    ("fault", "status", "said"),
+    [
+        ({"stamp_step_ns": 0}, "no_frame", "no new picture every 0.01 s"),
+        ({"frame_error": FrameStale("too old")}, "no_frame", "too old"),
+        ({"frame_data": b"x" * 9 * 2**20}, "error", "2 pictures have more than 16777216 bytes"),
+    ],
+)
+async def test_a_clip_of_old_or_too_large_pictures_is_not_sent(
+    runner: Any, client: RunnerClient, a_sidecar: Any, fault: Any, status: str, said: str
+) -> None:
+    vars(runner).update(fault)
+    async with a_sidecar("lab/vlm") as sidecar, SceneVlmClient(sidecar.endpoint) as vlm:
+        outcome = await Tools(client, None, vlm)(
+            QueryScene(question="Does it move?", frames=3, seconds=0.02)
+        )
+        assert outcome.status == status
+        assert said in outcome.text
+        assert "query" not in sidecar.asked

@@ -9,9 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.net.link import is_listening
+from vram_arbiter.clients.sidecar.perception import DetectorClient
 from vram_arbiter.reasoner.__main__ import main
+from vram_arbiter.reasoner.options import parser
 from vram_arbiter.reasoner.results import nothing_done
 from vram_arbiter.reasoner.server import send
+from vram_arbiter.reasoner.workplace import Workplace
 from vram_arbiter.schemas.reasoner import Result
 
 GRAB = ("--task", "grab the cube")
@@ -33,6 +38,8 @@ GRAB = ("--task", "grab the cube")
         ((*GRAB, "--planner", "openai"), 2, "LLM_BASE_URL and VRAM_REASONER_LLM_MODEL not set"),
         ((*GRAB, "--look"), 2, "--look is for a language model (--planner openai or anthropic"),
         ((*GRAB, "--runner", "runner.sock"), 2, "'runner.sock' is not an endpoint"),
+        ((*GRAB, "--detector", "so101-scene-vlm"), 2, "is a vlm, expected a detector"),
+        ((*GRAB, "--detector", "no/such"), 2, "no/such: cannot be read"),
         ((*GRAB, "--listen", "tcp://127.0.0.1:7"), 2, "any user of the machine"),
     ],
 )
@@ -76,3 +83,18 @@ def test_the_result_is_a_file_and_an_exit_code(
         main()
     assert ended.value.code == 1
     assert json.loads(file.read_text())["reason"] == "out of luck"
+
+
+@pytest.mark.heavy
+@pytest.mark.e2e
+@pytest.mark.anyio
+async def test_a_sidecar_is_there_as_long_as_the_reasoner_that_starts_it(
+    arbiter_daemon: ArbiterProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in arbiter_daemon.environ.items():
+        monkeypatch.setenv(name, value)
+    given = [*GRAB, "--detector", "so101-detector", "--scene-vlm", "none"]
+    client = DetectorClient(f"ipc://{arbiter_daemon.runtime}/detector.sock")
+    async with client, Workplace(parser(None).parse_args(given), None, None, None):
+        assert (await client.ping())["rskill"] == "vram-arbiter/so101-detector"
+    assert not is_listening(client.endpoint)

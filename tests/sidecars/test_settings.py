@@ -177,7 +177,12 @@ def test_flags_and_environment_become_settings(rskill, tmp_path, monkeypatch):
     ("text", "told"),
     [
         (DETECTOR.replace("{labels: [x]}", "{labels: [x], engine: rtdetr_onnx}"), "engine"),
-        (DETECTOR + "runtime: onnx\n", "runtime 'onnx'"),
+        (DETECTOR + "runtime: gguf\n", "runtime 'gguf'"),
+        (
+            DETECTOR.replace("{labels: [x]}", "{labels: [x], engine: zeroshot_hf}")
+            + "runtime: onnx\n",
+            "engine zeroshot_hf is not served by onnx",
+        ),
         (HEAD + "kind: wam\nweights_uri: hf://a/b\nactions: [grasp]\n", "kind 'wam' is not served"),
         (
             HEAD + "kind: segmenter\nweights_uri: hf://a/b\nactions: [detect]\nsegmenter: {engine: "

@@ -2,6 +2,8 @@
 mistakes are said.
 """
 
+import argparse
+import contextlib
 import fcntl
 import os
 import signal
@@ -12,9 +14,12 @@ from typing import Any
 import pytest
 
 from tests.support.prepared import Forked, start
+from tests.support.process import ArbiterProcess
+from vram_arbiter.clients.net.link import is_listening
 from vram_arbiter.clients.runner import RunnerClient, RunnerUnreachable
+from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.runner.__main__ import main, parse
-from vram_arbiter.runner.cli.common import sidecars_given
+from vram_arbiter.runner.cli.common import add_skill_flags, sidecars_given, start_sidecars
 from vram_arbiter.runner.goals.catalogue import sidecar_endpoint
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.goals import PingRunner
@@ -122,7 +127,9 @@ def test_wrong_flags_are_usage_errors(capsys: pytest.CaptureFixture[str]) -> Non
     [
         (["--scene", "none.yaml"], "none.yaml"),
         (["--skills", "none"], "none"),
-        (["--sidecar", "grab"], "RSKILL=ENDPOINT"),
+        (["--sidecar", "grab"], "grab: cannot be read"),
+        (["--sidecar", "ipc:///x"], "RSKILL=ENDPOINT"),
+        (["--sidecar", "=ipc:///x"], "RSKILL=ENDPOINT"),
         (
             ["--sidecar", "vram-arbiter/so101-grap=ipc:///x"],
             "--sidecar vram-arbiter/so101-grap: no such policy",
@@ -196,3 +203,22 @@ async def test_a_runner_that_is_not_there_is_unreachable(tmp_path: Path) -> None
     async with RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=0.2) as client:
         with pytest.raises(RunnerUnreachable):
             await client.skills()
+
+
+@pytest.mark.heavy
+@pytest.mark.e2e
+async def test_a_sidecar_is_there_as_long_as_the_runner_that_starts_it(
+    arbiter_daemon: ArbiterProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in arbiter_daemon.environ.items():
+        monkeypatch.setenv(name, value)
+    elsewhere = "lab/other=ipc:///run/other.sock"
+    flags = argparse.ArgumentParser()
+    add_skill_flags(flags)
+    args = flags.parse_args(["--sidecar", "so101-grab", "--sidecar", elsewhere])
+    endpoint = sidecars_given(args.sidecar)["vram-arbiter/so101-grab"]
+    async with contextlib.AsyncExitStack() as stack:
+        await start_sidecars(args, stack)
+        async with PolicyClient(endpoint) as client:
+            assert (await client.ping())["rskill"] == "vram-arbiter/so101-grab"
+    assert not is_listening(endpoint)

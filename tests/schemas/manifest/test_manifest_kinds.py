@@ -29,6 +29,7 @@ VALUES: dict[str, Any] = {
         if field in RULES and value
     },
     "model_family": "act",  # pi05 would ask for processors
+    "environment": ["transformers==5.5.0"],
 }
 """A valid value for every field of the table."""
 

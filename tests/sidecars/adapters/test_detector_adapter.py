@@ -9,7 +9,7 @@ from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.sidecar import DetectOp
 from vram_arbiter.sidecars.adapters.detector import (
     DetectorAdapter,
-    _detection,
+    detection,
     grounding_answer,
     split_query,
 )
@@ -49,12 +49,12 @@ def test_the_fields_grounding_format():
 
 def test_a_box_that_is_no_number_is_not_made_one():
     """Regression: cutting it to the picture put the picture's edge in its place."""
-    assert _detection("cube", 0.9, [-5.0, 3.0, 90.0, 9.0], (60, 80)) == {
+    assert detection("cube", 0.9, [-5.0, 3.0, 90.0, 9.0], (60, 80)) == {
         "label": "cube", "score": 0.9, "box": [0.0, 3.0, 80.0, 9.0],
     }  # fmt: skip
     for score, left in ((0.9, math.nan), (math.nan, 1.0)):
         with pytest.raises(ModelError, match="not a number"):
-            _detection("cube", score, [left, 3.0, 9.0, 9.0], (60, 80))
+            detection("cube", score, [left, 3.0, 9.0, 9.0], (60, 80))
 
 
 @pytest.mark.heavy
