@@ -42,6 +42,7 @@ class Runner:
         self.estop: str | None = None
         self.skills: list[dict[str, Any]] = []
         self.diagnostics: dict[str, str] = {}
+        self.world: Message = {}
         self.frame_error: VramError | None = None
         self.camera_model: dict[str, Any] | None = None
         self.ends_on_cancel = True
@@ -131,7 +132,7 @@ class Runner:
                     "goal": self.goal.goal_id if self.goal else None,
                     "phase": "idle",
                     "estop": self.estop,
-                    "world": {"diagnostics": dict(self.diagnostics)},
+                    "world": {"diagnostics": dict(self.diagnostics)} | self.world,
                     "session": SESSION,
                 }
             case GetSkills():
