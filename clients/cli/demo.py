@@ -371,9 +371,7 @@ async def _until_back(client: AsyncClient, display: Display, watch: Watch) -> No
     if (back := returned(watch.events)) is not None:
         await asyncio.sleep(SHOWN_S)
         await _look(client, display, watch)
-        display.say(
-            f"the detector is back by itself, {back['after_s']} s after the grab's last use"
-        )
+        display.say(f"the detector is back by itself, {back['after_s']} s after the grab")
     elif not watch.detector_held:
         display.say(f"the detector is not back after {BACK_S:.0f} s")
 

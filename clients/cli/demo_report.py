@@ -101,15 +101,16 @@ def summarise(
 
 
 def returned(events: Sequence[JsonMap]) -> JsonObject | None:
-    """Return how the detector came back after the grab's last use; None: it did not, or was never
-    away.
+    """Return how the detector came back after the grab; None: it did not, or was never away.
 
-    `after_s` is until its model was loaded; `verdict` is on the bytes that the grab gave up.
+    `after_s` is from the grab's last use (its grant, where it failed before one) until the detector
+    was loaded; `verdict` is on the bytes that the grab gave up.
     """
     newest: dict[tuple[str, str], JsonMap] = {}
     for event in events:
         newest[event["kind"], event.get("consumer", "")] = event
-    used, gone = newest.get(("use_ended", "grab")), newest.get(("verified", "grab"))
+    used = newest.get(("use_ended", "grab")) or newest.get(("granted", "grab"))
+    gone = newest.get(("verified", "grab"))
     granted, ready = newest.get(("granted", "detector")), newest.get(("ready", "detector"))
     if used is None or gone is None or granted is None or ready is None:
         return None

@@ -1,9 +1,10 @@
 """World state: joint state, camera frames and detections, each fresh or marked as stale.
 
 Fails closed. A component older than its limit is `stale` in `diagnostics`, one whose source failed
-is `error`; a camera's frame is then missing from `image_frames`, and both stay so (latched) until RECOVERY_UPDATES fresh values have
-come in a row: a camera that flickers must not make the arm jerk. Nothing is filled in: without any
-joint state there is no world state. Must not know sensors or robots; any thread may call it.
+is `error`. A camera's frame is then missing from `image_frames`, and both stay so (latched) until
+RECOVERY_UPDATES fresh values have come in a row: a camera that flickers must not make the arm jerk.
+Nothing is filled in: without any joint state there is no world state. Must not know sensors or
+robots; any thread may call it.
 """
 
 from __future__ import annotations

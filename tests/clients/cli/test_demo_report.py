@@ -98,6 +98,8 @@ def test_the_detector_returns_after_the_grabs_bytes_are_measured_gone() -> None:
     events = [one | {"seq": n, "at_wall_s": 100.0 + n} for n, one in enumerate(told)]
     back = {"after_s": 3.0, "reason": "there is room", "verdict": "verified"}
     assert demo_summary(events=events)["detector_back"] == back
+    failed = [events[0] | {"kind": "granted"}, *events[1:]]
+    assert returned(failed) == back, "its model did not load"
     assert returned(events[:-1]) is None, "its model is not loaded yet"
     before = [events[-2] | {"seq": -2}, events[-1] | {"seq": -1}, *events[:2]]
     assert returned(before) is None, "that was before the grab"
