@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vram_arbiter.reasoner.palette import Palette
-from vram_arbiter.reasoner.planner import Episode, Note, Outcome, Status, Step
+from vram_arbiter.reasoner.planner import Episode, Note, Outcome, Sight, Status, Step
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
 from vram_arbiter.schemas.tools import (
     ExecuteRskill,
@@ -49,6 +49,8 @@ MEANING: dict[Status, str] = {
 
 
 RAN = "the policy ran to its end; whether it reached its aim was not judged: look, or ask"
+SEEN = "what continuous detectors see in their cameras now; they know only what they look for"
+BLIND = "no detector has looked through these cameras: this says nothing about the scene"
 NOT_SHOWN = "the picture is not shown any more; look again"
 
 SOURCE: dict[type[ToolCall], str] = {
@@ -98,7 +100,9 @@ Turn = Words | Called | Answered | Thought
 
 
 def conversation(episode: Episode, palette: Palette) -> list[Turn]:
-    """Return task, steps and notes in order; a running goal comes last, without an outcome yet."""
+    """Return task, steps and notes in order; a running goal comes last, without an outcome yet,
+    and then what continuous detectors see.
+    """
     turns: list[Turn] = [Words(episode.task)]
     notes = list(episode.notes)
     pictures = [n for n, step in enumerate(episode.steps) if step.outcome.picture]
@@ -106,11 +110,30 @@ def conversation(episode: Episode, palette: Palette) -> list[Turn]:
         turns += _notes(notes, number)
         turns += _step(number, step, palette, shown=number in pictures[-PICTURES_MAX:])
     if episode.running is None:
-        return turns + _notes(notes, len(episode.steps))
+        return turns + _notes(notes, len(episode.steps)) + _sight(episode.sight)
     number = len(episode.steps)
     runs = json.dumps({"status": "running", "meaning": "the goal runs; it is not over"})
     turns += [_called(number, episode.running, palette), Answered(_id(number), runs)]
-    return turns + _notes(notes, number)
+    return turns + _notes(notes, number) + _sight(episode.sight)
+
+
+def _sight(sight: Sight | None) -> list[Turn]:
+    """Return what is seen now, and nothing of what was seen before."""
+    if sight is None:
+        return []
+    seen = [
+        {
+            "label": _short(one.label),
+            "camera": _short(one.camera),
+            "confidence": round(one.confidence, 2),
+            "age_s": round(one.age_s, 1),
+        }
+        for one in sight.seen[:ITEMS_MAX]
+    ]
+    fields: JsonObject = {"detected_objects": seen, "meaning": SEEN}
+    if sight.blind:
+        fields |= {"not_looking": list(sight.blind), "meaning_of_not_looking": BLIND}
+    return [Words(f"world state: {json.dumps(fields, ensure_ascii=False, allow_nan=False)}")]
 
 
 def _notes(notes: list[Note], after: int) -> list[Turn]:

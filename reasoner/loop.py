@@ -21,7 +21,16 @@ from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.reasoner.inbox import Cancel, Danger, Inbox, Said
 from vram_arbiter.reasoner.palette import Palette
-from vram_arbiter.reasoner.planner import Episode, Finish, Note, Outcome, Planner, Step, benched
+from vram_arbiter.reasoner.planner import (
+    Episode,
+    Finish,
+    Note,
+    Outcome,
+    Planner,
+    Sight,
+    Step,
+    benched,
+)
 from vram_arbiter.reasoner.results import result_of
 from vram_arbiter.schemas.errors import EstopRequested, VramError
 from vram_arbiter.schemas.reasoner import Result
@@ -56,6 +65,7 @@ SUPERSEDED_MAX = 3  # an operator that keeps sending texts must not keep the pla
 STOP_MAX_S = 15.0  # at the end, for a canceled goal to report
 
 Dispatch = Callable[[ToolCall], Awaitable[Outcome]]
+LookAt = Callable[[], Awaitable[Sight | None]]
 
 
 class _NoDecision(Finish):
@@ -73,15 +83,17 @@ async def run_episode(
     dispatch: Dispatch,
     *,
     inbox: Inbox | None = None,
+    look_at: LookAt | None = None,
     steps_max: int = STEPS_MAX,
     think_max_s: float = THINK_MAX_S,
 ) -> Result:
     """Run one task to its end. Never raises for a planner or a tool: the result tells how it ended.
 
+    `look_at` returns what continuous detectors see, before each question to the planner.
     A canceled episode cancels its goal and waits for it, at most `STOP_MAX_S`.
     """
     loop = _Loop(
-        Episode(task), planner, palette, dispatch, inbox or Inbox(), steps_max, think_max_s
+        Episode(task), planner, palette, dispatch, inbox or Inbox(), look_at, steps_max, think_max_s
     )
     finish = await loop.run()
     log.info("%s: %s", "success" if finish.success else "failure", finish.reason)
@@ -96,6 +108,7 @@ class _Loop:
     palette: Palette
     dispatch: Dispatch
     inbox: Inbox
+    look_at: LookAt | None
     steps_max: int
     think_max_s: float
     _thinking: asyncio.Task[ToolCall | Finish] | None = None
@@ -158,6 +171,8 @@ class _Loop:
         with tracing.span(telemetry.SPAN_PLAN):
             try:
                 async with asyncio.timeout(self.think_max_s):
+                    if self.look_at is not None:
+                        self.episode.sight = await self.look_at()
                     decision = await self.planner.decide(self.episode)
                 outcome = "finish" if isinstance(decision, Finish) else decision.tool
                 return decision

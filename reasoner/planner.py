@@ -62,6 +62,28 @@ class Note:
 
 
 @dataclass(frozen=True, slots=True)
+class Seen:
+    """A thing that a continuous detector sees in a camera; `age_s` counts from its picture."""
+
+    label: str
+    confidence: float
+    camera: str
+    age_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What continuous detectors see now.
+
+    `blind`: cameras whose detector has not looked within its bound, evicted for example. They say
+    nothing about the scene.
+    """
+
+    seen: tuple[Seen, ...]
+    blind: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Finish:
     """The planner's last word."""
 
@@ -80,6 +102,8 @@ class Episode:
     """The goal that runs while the planner is asked: only `wait`, `stop_goal` and the end are
     valid.
     """
+    sight: Sight | None = None
+    """As of this question to the planner; None: no detector looks all the time."""
 
     def attempts(self, manipulation: frozenset[str]) -> int:
         """Return how many goals of the skills named in `manipulation` were executed."""

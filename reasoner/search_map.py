@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+from vram_arbiter.reasoner.planner import Seen
 from vram_arbiter.schemas.plain import JsonMap
 
 # two looks at one thing differ by less; the arm's gripper needs more room between two things
@@ -127,8 +128,16 @@ class Search:
     doubted: list[Place] = field(default_factory=list)
     """Where things stood that were in the hand and that the scene VLM called something else."""
     began: bool = False
+    seen: Sequence[Seen] = ()
+    """What continuous detectors see now."""
     _views: list[Pose] = field(default_factory=list)
     _given: int = 0
+
+    def camera_of(self, thing: str) -> str:
+        """Return the camera whose detector sees the thing most surely now; empty: none does."""
+        such = [one for one in self.seen if one.label.lower() == thing]
+        best = max(such, key=lambda one: one.confidence, default=None)
+        return "" if best is None else best.camera
 
     def looked(self, pose: Sequence[float] | None) -> None:
         self.began = True

@@ -24,6 +24,7 @@ from vram_arbiter.reasoner.palette import OPERATOR, Palette, skills_of
 from vram_arbiter.reasoner.perception import FRAME_MAX_AGE_MS, Judge
 from vram_arbiter.reasoner.planner import Planner
 from vram_arbiter.reasoner.playbooks import Playbook
+from vram_arbiter.reasoner.sight import look_at
 from vram_arbiter.reasoner.tools import Tools
 from vram_arbiter.reasoner.watch import watch
 from vram_arbiter.schemas.body import read_body
@@ -133,6 +134,7 @@ class Workplace:
                     palette,
                     tools if confirm is None else confirm.before(tools),
                     inbox=inbox,
+                    look_at=lambda: look_at(self._watching),
                     steps_max=_steps_max(self._playbook),
                     think_max_s=_think_max_s(self._llm),
                 )

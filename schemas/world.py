@@ -233,6 +233,9 @@ class JointState(_Frozen):
 
 Diagnostic = Literal["ok", "warn", "error", "stale"]
 
+DETECTOR_PREFIX = "detector:"
+"""Of a continuous detector's name in `diagnostics`; its camera's name follows."""
+
 
 class WorldState(_Frozen):
     """One snapshot of everything that a skill may look at. `diagnostics` says which component is

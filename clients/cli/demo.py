@@ -27,6 +27,7 @@ from vram_arbiter.clients.cli.demo_report import (
     MemoryStory,
     draw_timeline,
     read_log,
+    returned,
     summarise,
 )
 from vram_arbiter.clients.client import AsyncClient
@@ -46,11 +47,14 @@ from vram_arbiter.schemas.urls import HttpAddress, http_address
 
 DESCRIPTIONS = {
     "demo": "Run find, navigate, grab on a simulated SO-101 inside an 8 GiB GPU budget. Exits 0 if "
-    "the demo shows what it promises (with the arbiter: completed without any out-of-memory; "
-    "without: an out-of-memory), 1 if not."
+    "the demo shows what it promises (with the arbiter: completed without any out-of-memory, and "
+    "the detector back on the GPU; without: an out-of-memory), 1 if not."
 }
 SEED_MAX = 2**31 - 1
 SIDECARS = {"detector": "so101-detector", "scene-vlm": "so101-scene-vlm", "grab": "so101-grab"}
+# the detector is resident between goals; the models of a goal leave when they are idle
+IDLE = ["--idle-release-s", "5"]
+RESIDENCY = {"detector": ["--standby"], "scene-vlm": IDLE, "grab": IDLE}
 BUDGET = "8GiB"
 # of the simulated GPU: a copy from ordinary host RAM over PCIe 4.0
 COPY_BYTES_PER_S = 6_000_000_000
@@ -58,6 +62,8 @@ BOOT_S = 240.0
 LOOP_S = (
     400.0  # it takes one or two minutes; a machine with other work on its cores has time as well
 )
+BACK_S = 90.0  # for the detector, once the reasoner has ended: idle seconds, and one load
+SHOWN_S = 3.0  # watched on, so that the timeline shows it
 POLL_S = 0.2
 
 
@@ -81,6 +87,7 @@ class Watch:
     events: list[JsonObject] = field(default_factory=list)
     measured: list[tuple[float, int]] = field(default_factory=list)
     capacity_bytes: int = 0
+    detector_held: bool = False  # when it was last looked at
 
 
 def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
@@ -134,7 +141,8 @@ def _address(text: str) -> HttpAddress:
 def run(args: argparse.Namespace) -> int:
     """Run the demo. Returns 0 if it shows what it promises.
 
-    With the arbiter: completed without an out-of-memory. Without: an out-of-memory.
+    With the arbiter: completed without an out-of-memory, and the detector is back on the GPU.
+    Without: an out-of-memory.
     """
     if args.quick:
         from vram_arbiter.clients.cli import demo_quick
@@ -160,7 +168,8 @@ def run(args: argparse.Namespace) -> int:
     print(json.dumps({key: value for key, value in summary.items() if key != "loads"}, indent=2))
     print(f"written: {out}/summary.json, {out}/timeline.png, {out}/episode.mp4")
     oom = summary["oom_events"] > 0
-    return 0 if (summary["completed"] and not oom if arbiter else oom) else 1
+    shown = summary["completed"] and summary["detector_resident"] and not oom
+    return 0 if (shown if arbiter else oom) else 1
 
 
 async def _demo(what: Episode) -> JsonObject:
@@ -208,6 +217,8 @@ async def _episode(programs: Programs, runtime: Path, what: Episode) -> JsonObje
         await _watch(programs, reasoner, client, display, watch)
         truth = await runner.ground_truth()
         seconds = time.monotonic() - watch.start_s
+        if client is not None:
+            await _until_back(client, display, watch)
     await programs.stop("runner")  # finishes the video
     story = _story(folder, gpu, programs.pids(), watch)
     outcome = (
@@ -219,7 +230,7 @@ async def _episode(programs: Programs, runtime: Path, what: Episode) -> JsonObje
     summary = summarise(
         seed=what.seed, arbiter=arbiter, task=task, story=story, capacity_bytes=capacity,
         events=watch.events, reasoner=outcome, truth=truth,
-        target=target, seconds=seconds,
+        target=target, seconds=seconds, detector_resident=watch.detector_held,
     )  # fmt: skip
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     title = (
@@ -229,6 +240,7 @@ async def _episode(programs: Programs, runtime: Path, what: Episode) -> JsonObje
     draw_timeline(
         out / "timeline.png", story, capacity, watch.events,
         watch.measured if gpu == "nvml" else (), start_s=watch.start_s,
+        end_s=max((at_s for at_s, _ in watch.measured), default=0.0),
         wall_offset_s=watch.wall_offset_s,
         title=title + ("" if arbiter else " (no arbiter)"),
     )  # fmt: skip
@@ -279,8 +291,9 @@ async def boot(
     device = "cuda" if gpu == "nvml" else f"fake:{runtime}/fakegpu"
     for name, rskill in SIDECARS.items():
         manifest = str(configs_folder(os.environ) / "rskills" / rskill / "rskill.yaml")
+        stays = without or RESIDENCY[name]
         await programs.start(
-            name, "sidecars", "--name", name, "--rskill", manifest, "--device", device, *without
+            name, "sidecars", "--name", name, "--rskill", manifest, "--device", device, *stays
         )
     video = str((what.out / "episode.mp4").resolve())
     await programs.start(
@@ -349,6 +362,20 @@ async def _watch(
         ended.cancel()
 
 
+async def _until_back(client: AsyncClient, display: Display, watch: Watch) -> None:
+    """Wait until the detector, whose lease is on standby, is resident again: nothing calls it."""
+    deadline_s = time.monotonic() + BACK_S
+    while not watch.detector_held and time.monotonic() < deadline_s:
+        await asyncio.sleep(POLL_S)
+        await _look(client, display, watch)
+    if (back := returned(watch.events)) is not None:
+        await asyncio.sleep(SHOWN_S)
+        await _look(client, display, watch)
+        display.say(f"the detector is back by itself, {back['after_s']} s after the grab")
+    elif not watch.detector_held:
+        display.say(f"the detector is not back after {BACK_S:.0f} s")
+
+
 async def _look(client: AsyncClient | None, display: Display, watch: Watch) -> None:
     if client is None:
         return
@@ -356,6 +383,8 @@ async def _look(client: AsyncClient | None, display: Display, watch: Watch) -> N
     gpu = status["gpus"][0]
     watch.measured.append((time.monotonic(), gpu["measured_used_bytes"] or 0))
     watch.capacity_bytes = gpu["capacity_bytes"]
+    leases = {lease["consumer"]: lease["state"] for lease in status["leases"]}
+    watch.detector_held = leases.get("detector") == "held"
     after = watch.events[-1]["seq"] if watch.events else 0
     for event in (await client.history(after=after)).events:
         watch.events.append(dict(event))

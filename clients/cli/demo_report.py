@@ -14,6 +14,7 @@ from vram_arbiter.clients.cli.timeline.reader import Reader
 from vram_arbiter.clients.cli.timeline.story import Mark
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
 
+LEAD_S = 1.0
 SPLIT = ("wait_ms", "drain_ms", "unload_ms", "verify_ms", "load_ms", "total_ms")
 
 
@@ -59,7 +60,7 @@ def read_log(text: str, names: Mapping[int, str]) -> MemoryStory:
 def summarise(
     *, seed: int, arbiter: bool, task: str, story: MemoryStory, capacity_bytes: int,
     events: Sequence[JsonMap],
-    reasoner: JsonMap, truth: JsonMap, target: str, seconds: float,
+    reasoner: JsonMap, truth: JsonMap, target: str, seconds: float, detector_resident: bool,
 ) -> JsonObject:  # fmt: skip
     """The demo's outcome. `completed` needs three witnesses: the simulator, the scene VLM and the
     reasoner."""
@@ -85,6 +86,8 @@ def summarise(
         "peak_bytes": story.peak_bytes,
         "capacity_bytes": capacity_bytes,
         "seconds": round(seconds, 1),
+        "detector_resident": detector_resident,
+        "detector_back": returned(events),
         "loads": [
             {
                 "consumer": event["consumer"],
@@ -97,6 +100,29 @@ def summarise(
     }
 
 
+def returned(events: Sequence[JsonMap]) -> JsonObject | None:
+    """Return how the detector came back after the grab; None: it did not, or was never away.
+
+    `after_s` is from the grab's last use (its grant, where it failed before one) until the detector
+    was loaded; `verdict` is on the bytes that the grab gave up.
+    """
+    newest: dict[tuple[str, str], JsonMap] = {}
+    for event in events:
+        newest[event["kind"], event.get("consumer", "")] = event
+    used = newest.get(("use_ended", "grab")) or newest.get(("granted", "grab"))
+    gone = newest.get(("verified", "grab"))
+    granted, ready = newest.get(("granted", "detector")), newest.get(("ready", "detector"))
+    if used is None or gone is None or granted is None or ready is None:
+        return None
+    if not used["seq"] < gone["seq"] < granted["seq"] < ready["seq"]:
+        return None
+    return {
+        "after_s": round(ready["at_wall_s"] - used["at_wall_s"], 1),
+        "reason": granted["reason"],
+        "verdict": gone["verdict"],
+    }
+
+
 def draw_timeline(
     path: Path,
     story: MemoryStory,
@@ -105,15 +131,17 @@ def draw_timeline(
     measured: Sequence[tuple[float, int]] = (),
     *,
     start_s: float,
+    end_s: float = 0.0,
     wall_offset_s: float,
     title: str,
 ) -> None:
-    """Draw the bytes of each program since the start as `vramctl timeline` does; each refused
-    allocation is a moment."""
-    begin_s = start_s + wall_offset_s
+    """Draw the bytes of each program as `vramctl timeline` does, from `LEAD_S` before the first
+    ones to `end_s` or the last event; each refused allocation is a moment."""
+    first_s = min((point.at_s for point in story.points), default=start_s)
+    begin_s = max(start_s, first_s - LEAD_S) + wall_offset_s
     gpu = next((str(event["gpu"]) for event in events if event.get("gpu")), "GPU")
     reader = Reader(begin_s)
-    drawn, ends = reader.gpu(gpu, "GPU", capacity_bytes), [begin_s + 1.0]
+    drawn, ends = reader.gpu(gpu, "GPU", capacity_bytes), [begin_s + 1.0, end_s + wall_offset_s]
     drawn.measured += [(at_s + wall_offset_s, used) for at_s, used in measured]
     for point in sorted(story.points, key=lambda point: point.at_s):
         at_s = point.at_s + wall_offset_s

@@ -68,7 +68,8 @@ class ScriptedPlanner:
     """
 
     def __init__(self, task: str, palette: Palette) -> None:
-        self._script = _Script.of(object_of(task), palette).run()
+        script = _Script.of(object_of(task), palette)
+        self._script, self._search = script.run(), script.search
         self._decided_after = -1  # steps: a decision that was thrown away is given again
         self._decision: ToolCall | Finish = Finish(False, "nothing was decided")
 
@@ -77,6 +78,7 @@ class ScriptedPlanner:
             return WaitOn(rationale="the script goes on when the goal has ended")
         if len(episode.steps) == self._decided_after:
             return self._decision
+        self._search.seen = () if episode.sight is None else episode.sight.seen
         try:
             self._decision = (
                 self._script.send(episode.steps[-1].outcome)
@@ -263,16 +265,21 @@ class _Script:
         """Note possible places and return the last outcome.
 
         Only `not_seen` says something about the scene, everything else is tried again. A word that
-        the detector's manifest does not name is said once, before the robot drives.
+        the detector's manifest does not name is said once, before the robot drives. A camera whose
+        continuous detector sees the thing now is looked through first; if it gives no place, the
+        default one is asked.
         """
         outcome = Outcome("error", "never looked")
-        for _ in range(LOOKS_MAX):
-            outcome = yield LocateInView(query=self.thing, rationale=f"where is the {self.thing}?")
+        watched = self.search.camera_of(self.thing)
+        for camera in [watched] * bool(watched) + [""] * LOOKS_MAX:
+            outcome = yield LocateInView(
+                query=self.thing, camera=camera, rationale=f"where is the {self.thing}?"
+            )
             looked = outcome.status == "found" or "base_pose" in outcome.data
             added = looked and places.add(outcome.data, self.search.others.values())
             if outcome.status == "found" and not added:
                 outcome = Outcome("not_seen", "what is seen was put down here", data=outcome.data)
-            if outcome.status in ("found", "not_seen"):
+            if outcome.status == "found" or (outcome.status == "not_seen" and not camera):
                 unknown = outcome.data.get("unknown_words")
                 if unknown and self.can_say and not self.search.began:
                     text = f"the detector's manifest does not name {', '.join(unknown)}: it may"

@@ -166,7 +166,7 @@ async def run(args: argparse.Namespace) -> int:
     log.info(
         "%d ticks, %d late, p99 %.1f ms",
         result.n_ticks,
-        result.budget_violations,
+        runner.deadline_misses,
         result.p99_tick_ms,
     )
     print(result.model_dump_json())

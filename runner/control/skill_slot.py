@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from vram_arbiter.runner.control.clock import Clock
@@ -29,6 +29,7 @@ from vram_arbiter.runner.protocols import (
     SkillEnded,
     Stepped,
 )
+from vram_arbiter.runner.safety.violations import SafetyViolation, check_of
 from vram_arbiter.schemas.errors import InternalError, LimitExceeded, ModelError, VramError
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
@@ -218,14 +219,12 @@ class SkillSlot:
     ) -> None:
         checked_s = self._clock.now_s()
         with tracing.span(telemetry.SPAN_SAFETY):
-            decision.action, problems = active.gate.check(action, world)
+            decision.action, found = active.gate.check(action, world)
+            found = (*found, short) if short else found
+            self._report(found, withheld=decision.action is None)
         decision.safety_ms = (self._clock.now_s() - checked_s) * 1e3
-        if short:
-            problems = (*problems, short)
-        decision.violations = problems
+        problems = decision.violations = tuple(map(str, found))
         self.violations.extend(problems)
-        if problems:
-            meters.count(telemetry.METRIC_SAFETY_VIOLATIONS, self.labels, len(problems))
         if decision.action is None:
             self._refused(active, problems[0])
         else:
@@ -233,6 +232,19 @@ class SkillSlot:
             active.tally.clamped += bool(problems)
             self.total.clamped += bool(problems)
             active.detail = ""
+
+    def _report(self, problems: Sequence[str], *, withheld: bool) -> None:
+        """Tell telemetry of the violations of one action; the first one is why it is withheld."""
+        for index, problem in enumerate(problems):
+            refused = withheld and index == 0
+            about = {
+                telemetry.ATTR_CHECK: check_of(problem),
+                telemetry.ATTR_SEVERITY: "error" if refused else "warning",
+            }
+            meters.count(telemetry.METRIC_SAFETY_VIOLATIONS, {**self.labels, **about})
+            tracing.event(telemetry.EVENT_SAFETY_VIOLATION, reason=str(problem), **about)
+            if refused:
+                tracing.refused(SafetyViolation(check_of(problem), problem), about)
 
     # -- actions that never reach the motors
     def input_stale(self, stale: StaleInput) -> Decision:

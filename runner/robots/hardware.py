@@ -118,9 +118,10 @@ class HardwareRobot:
         if self._synced is not None:
             self._synced.start()
         self.hal.connect()
-        for _ in range(FIRST_STATE_TRIES):
-            if self._read_joints():
-                break
+        with tracing.left_out(None):  # a span without a tick would be a trace of its own
+            for _ in range(FIRST_STATE_TRIES):
+                if self._read_joints():
+                    break
         self.world = self._snapshot()
 
     def _snapshot(self) -> WorldState:
@@ -204,8 +205,6 @@ class HardwareRobot:
         sensed_s = self._clock.now_s()
         with tracing.span(telemetry.SPAN_WORLD):
             self.world = self._snapshot()
-        for name in self.world.stale:
-            meters.count(telemetry.METRIC_WORLD_STALE, {telemetry.ATTR_COMPONENT: name})
         return Sensed(
             sensors_ms=(sensed_s - started_s) * 1e3,
             world_state_ms=(self._clock.now_s() - sensed_s) * 1e3,
@@ -231,8 +230,9 @@ class HardwareRobot:
                 else:
                     frame = together[name]
             except FrameStale as error:
-                meters.count(telemetry.METRIC_STALE_READS, {telemetry.ATTR_SENSOR: name})
-                self.aggregator.lose(name, error.message)
+                self._gave_nothing(name, error)
+                gone = bool(error.details.get("ended") or error.details.get("absent"))
+                self.aggregator.lose(name, error.message, failed=gone)
             else:
                 self._took(name, frame.stamp_monotonic_ns)
                 self.aggregator.update_image_frame(frame, self._clock.now_ns())
@@ -242,14 +242,15 @@ class HardwareRobot:
         began_s = self._clock.now_s()
         labels: dict[str, str] = {}
         try:
-            state = self.hal.read_state()
+            with tracing.span(telemetry.SPAN_READ):
+                state = self.hal.read_state()
         except EstopRequested as error:
             labels[telemetry.ATTR_ERROR_TYPE] = error.code
             self._stopped_by_hardware(error)
             return False
         except VramError as error:  # one lost answer is harmless: the age of the last one decides
             labels[telemetry.ATTR_ERROR_TYPE] = error.code
-            meters.count(telemetry.METRIC_STALE_READS, {telemetry.ATTR_SENSOR: JOINT_STATE})
+            self._gave_nothing(JOINT_STATE, error)
             self.aggregator.note(JOINT_STATE, error.message)
             return False
         finally:
@@ -257,6 +258,10 @@ class HardwareRobot:
         self._took(JOINT_STATE, state.stamp_ns)
         self.aggregator.update_joint_state(state, self._clock.now_ns())
         return True
+
+    def _gave_nothing(self, sensor: str, error: VramError) -> None:
+        meters.count(telemetry.METRIC_STALE_READS, {telemetry.ATTR_SENSOR: sensor})
+        tracing.event(telemetry.EVENT_SENSOR_STALE, sensor=sensor, reason=error.message)
 
     def _took(self, sensor: str, stamp_ns: int) -> None:
         age_s = (self._clock.now_ns() - stamp_ns) / 1e9
@@ -274,7 +279,6 @@ class HardwareRobot:
         first = self._stale_since_s is None
         if self._stale_since_s is None:
             self._stale_since_s = now_s
-            tracing.event(telemetry.EVENT_STALE, component=name)
         if now_s - self._stale_since_s < STALE_FAIL_S:
             return StaleInput(problem, first)
         kind = StateStale if name == JOINT_STATE else FrameStale

@@ -6,6 +6,7 @@ loop. The runner's deadline, gate and emergency stop hold for these goals as for
 
 from __future__ import annotations
 
+import contextlib
 import json
 import secrets
 from collections.abc import AsyncIterator
@@ -15,6 +16,7 @@ from vram_arbiter.clients.runner import Goal, RunnerClient
 from vram_arbiter.runner.ros2.action_server import Execution, Status
 from vram_arbiter.schemas.errors import BadRequest, RunnerUnreachable
 from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.schemas.runtime.telemetry import traceparent
 
 INTERFACE: Final = "openral_msgs/ExecuteRskill"
 NAME: Final = "/openral/execute_rskill"
@@ -37,9 +39,11 @@ class RunnerGoals:
     async def accept(self, goal_id: str, goal: JsonObject) -> Execution:
         """Send a goal to the runner.
 
-        `prompt_metadata_json` is not used. Raises BadRequest, and what the runner refuses it with.
+        A W3C `traceparent` in `prompt_metadata_json` is joined, and nothing else there is read.
+        Raises BadRequest, and what the runner refuses it with.
         """
-        trace_id = secrets.token_hex(16)
+        caller = _traceparent(goal["prompt_metadata_json"])
+        context = caller or f"00-{secrets.token_hex(16)}-{secrets.token_hex(8)}-01"
         sent = await self._client.send_goal(
             goal["rskill_id"],
             revision=goal["revision"],
@@ -47,9 +51,9 @@ class RunnerGoals:
             goal_params=_params(goal["goal_params_json"]),
             deadline_s=max(0.0, goal["deadline_s"]),
             goal_id=goal_id,
-            traceparent=f"00-{trace_id}-{secrets.token_hex(8)}-01",
+            traceparent=context,
         )
-        return _RunnerGoal(sent, trace_id)
+        return _RunnerGoal(sent, context.split("-")[1])
 
 
 class _RunnerGoal:
@@ -75,6 +79,15 @@ class _RunnerGoal:
 
     def _as_result(self, success: bool, reason: str) -> JsonObject:
         return {"success": success, "failure_reason": reason, "trace_id": self._trace_id}
+
+
+def _traceparent(text: str) -> str | None:
+    """Return the caller's traceparent; None for everything else, which is no reason to refuse."""
+    with contextlib.suppress(ValueError, RecursionError):
+        metadata = json.loads(text)
+        if isinstance(metadata, dict):
+            return traceparent.read(metadata.get("traceparent"))
+    return None
 
 
 def _params(text: str) -> JsonObject:

@@ -24,6 +24,7 @@ from vram_arbiter.runner.safety.limits import (
     tighten,
 )
 from vram_arbiter.runner.safety.ranges import CLAMP_TOLERANCE_RAD, JointRanges
+from vram_arbiter.runner.safety.violations import SafetyViolation, Violation
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.contracts import SafetyEnvelope
@@ -48,7 +49,7 @@ EPSILON = 1e-9
 
 Targets = dict[str, float]
 Sent = Callable[[], Mapping[str, float]]
-Verdict = tuple[Action | None, tuple[str, ...]]
+Verdict = tuple[Action | None, tuple[Violation, ...]]
 
 
 @dataclass(slots=True)
@@ -72,10 +73,6 @@ class _Motion:
     elapsed_s: float  # what a step's length is measured by
     unused_s: float  # what has passed since the last one, and what was left then: no step uses more
     yielding: frozenset[str]
-
-
-class _Withheld(Exception):
-    """The one reason why nothing of an action is applied."""
 
 
 class RobotGate:
@@ -156,38 +153,41 @@ class RobotGate:
     # -- one action
     def check(self, action: Action, world: WorldState) -> Verdict:
         """Return the action to apply, possibly shortened, or None; and the violations."""
-        problems: list[str] = []
+        problems: list[Violation] = []
         try:
             allowed = self._judge(action, world, problems)
-        except _Withheld as reason:
-            return None, (str(reason), *problems)
+        except SafetyViolation as reason:
+            return None, (reason.violation, *problems)
         return allowed, tuple(problems)
 
-    def _judge(self, action: Action, world: WorldState, problems: list[str]) -> Action:
+    def _judge(self, action: Action, world: WorldState, problems: list[Violation]) -> Action:
         """Check an action.
 
         Order: 1. latch, freshness, form; a base's speed, and for an arm 2. ranges 3. measured state
         4. efforts 5. joint speed 6. tool speed 7. workspace.
         """
         if self._memory.tripped:
-            raise _Withheld(f"the emergency stop is latched: {self._memory.tripped}")
+            raise SafetyViolation("estop", f"the emergency stop is latched: {self._memory.tripped}")
         self._fresh(world)
         if action.horizon != 1:
-            raise _Withheld(f"{action.horizon} steps at once: the gate passes one at a time")
+            raise SafetyViolation(
+                "form", f"{action.horizon} steps at once: the gate passes one at a time"
+            )
         if action.body_twist is not None:
             self._base_speed(action.body_twist[0])
             if action.control_mode is ControlMode.BODY_TWIST:
                 return action
         names = action.joint_names or self._robot.joint_names
         if len(set(names)) != len(names):
-            raise _Withheld("a joint is commanded twice")
+            raise SafetyViolation("form", "a joint is commanded twice")
         allowed, found = self._ranges.check(action, world)
         problems += found
         if allowed is None:
-            raise _Withheld(problems.pop(0))
+            first = problems.pop(0)
+            raise SafetyViolation(first.check, first)
         measured = dict(zip(world.joint_state.name, world.joint_state.position, strict=True))
         if missing := [name for name in self.limits.joints_rad if name not in measured]:
-            raise _Withheld(f"the state of {', '.join(missing)} is not measured")
+            raise SafetyViolation("freshness", f"the state of {', '.join(missing)} is not measured")
         self._speed_is_sound(world)
         targets = dict(zip(names, allowed.rows[0], strict=True))
         yielding = self._yield(targets, measured, world, problems)
@@ -213,36 +213,42 @@ class RobotGate:
             if name == "joint_state" or self._needs is None or name in self._needs
         ]
         if stale:
-            raise _Withheld(f"stale: {', '.join(stale)}")
+            raise SafetyViolation("freshness", f"stale: {', '.join(stale)}")
         now_ns = world.stamp_ns if self._now_ns is None else max(world.stamp_ns, self._now_ns())
         age_s = (now_ns - world.joint_state.stamp_ns) / 1e9
         if age_s > MAX_STATE_AGE_S:
-            raise _Withheld(f"the joint state is stale: {age_s:.2f} s old")
+            raise SafetyViolation("freshness", f"the joint state is stale: {age_s:.2f} s old")
 
     def _base_speed(self, twist: Twist) -> None:
         if self._robot.base is None:
-            raise _Withheld(f"{self._robot.name} has no base to drive")
+            raise SafetyViolation("base_speed", f"{self._robot.name} has no base to drive")
         vx, vy, vz, wx, wy, wz = twist
         if vz or wx or wy:
-            raise _Withheld(f"{self._robot.name} drives on a plane: vz, wx and wy must be 0")
+            raise SafetyViolation(
+                "base_speed", f"{self._robot.name} drives on a plane: vz, wx and wy must be 0"
+            )
         speed, turn = math.hypot(vx, vy), abs(wz)
         most, fastest = self.limits.base_speed_m_s + EPSILON, self.limits.base_turn_rad_s + EPSILON
         if not (speed <= most and turn <= fastest):  # said so that a NaN is withheld, too
-            raise _Withheld(
+            raise SafetyViolation(
+                "base_speed",
                 f"base speed {speed:.2f} m/s, {turn:.2f} rad/s is beyond "
-                f"{self.limits.base_speed_m_s:.2f} m/s, {self.limits.base_turn_rad_s:.2f} rad/s"
+                f"{self.limits.base_speed_m_s:.2f} m/s, {self.limits.base_turn_rad_s:.2f} rad/s",
             )
 
     def _speed_is_sound(self, world: WorldState) -> None:
         for name, speed in zip(world.joint_state.name, world.joint_state.velocity, strict=False):
             limit = self.limits.speeds_rad_s.get(name, math.inf)
             if abs(speed) > OVERSPEED * limit:
-                raise _Withheld(f"{name} moves at {speed:.2f} rad/s, the limit is {limit:.2f}")
+                raise SafetyViolation(
+                    "measured_speed", f"{name} moves at {speed:.2f} rad/s, the limit is {limit:.2f}"
+                )
         for place, force in world.contact_forces.items():
             if math.hypot(*force) > self.limits.contact_force_n:
-                raise _Withheld(
+                raise SafetyViolation(
+                    "contact_force",
                     f"{place}: {math.hypot(*force):.1f} N of contact,"
-                    f" the limit is {self.limits.contact_force_n:g}"
+                    f" the limit is {self.limits.contact_force_n:g}",
                 )
 
     # -- efforts
@@ -251,7 +257,7 @@ class RobotGate:
         targets: Targets,
         measured: Mapping[str, float],
         world: WorldState,
-        problems: list[str],
+        problems: list[Violation],
     ) -> frozenset[str]:
         """Move the targets of joints that push too hard nearer to their positions.
 
@@ -271,9 +277,8 @@ class RobotGate:
             low, high = self.limits.joints_rad[name]
             targets[name] = min(max(most, low), high)
             yielding.add(name)
-            problems.append(
-                f"{name} pushes with {abs(effort):.2f} N·m, the limit is {limit:.2f}: it yields"
-            )
+            said = f"{name} pushes with {abs(effort):.2f} N·m, the limit is {limit:.2f}: it yields"
+            problems.append(Violation("effort", said))
         return frozenset(yielding)
 
     def _effort_limit_nm(self, name: str) -> float:
@@ -323,7 +328,7 @@ class RobotGate:
             used.append(way / self.limits.ee_speed_m_s)
         return max(used, default=0.0)
 
-    def _joint_speed(self, targets: Targets, motion: _Motion, problems: list[str]) -> None:
+    def _joint_speed(self, targets: Targets, motion: _Motion, problems: list[Violation]) -> None:
         grippers = {joint.name for joint in self._robot.joints if joint.gripper}
         for name, value in targets.items():
             if name in motion.yielding:
@@ -339,8 +344,8 @@ class RobotGate:
                 if (
                     excess > CLAMP_TOLERANCE_RAD and name not in grippers
                 ):  # a gripper just closes more slowly
-                    raise _Withheld(said)
-                problems.append(said)
+                    raise SafetyViolation("joint_speed", said)
+                problems.append(Violation("joint_speed", said))
                 low, high = self.limits.joints_rad[name]
                 targets[name] = min(
                     max(motion.start[name] + math.copysign(longest, step), low), high
@@ -351,14 +356,15 @@ class RobotGate:
             ):  # a grasp is meant to block
                 # withholding would keep up the pressure; a policy that continues from its far
                 # target is withheld as too fast
-                problems.append(
+                said = (
                     f"{name} is {behind:.2f} rad behind its target:"
                     " it does not follow, and is relaxed"
                 )
+                problems.append(Violation("following_error", said))
                 low, high = self.limits.joints_rad[name]
                 targets[name] = motion.start[name] = min(max(motion.measured[name], low), high)
 
-    def _tool_speed(self, targets: Targets, motion: _Motion, problems: list[str]) -> None:
+    def _tool_speed(self, targets: Targets, motion: _Motion, problems: list[Violation]) -> None:
         longest = min(self.limits.ee_speed_m_s * motion.elapsed_s, self.limits.ee_step_m)
         if self._kinematics is None or longest == math.inf:
             return
@@ -372,8 +378,8 @@ class RobotGate:
         )
         share = longest / way
         if share < SHORTENED_MIN:
-            raise _Withheld(said)
-        problems.append(said)
+            raise SafetyViolation("tool_speed", said)
+        problems.append(Violation("tool_speed", said))
         shorter: Targets = {}
         for _ in range(SHORTENINGS_MAX):  # an arc is longer than its chord: shorten until it fits
             shorter = {
@@ -385,13 +391,13 @@ class RobotGate:
                 break
             share *= 0.999 * longest / way
         else:
-            raise _Withheld(said)
+            raise SafetyViolation("tool_speed", said)
         for name, value in shorter.items():
             low, high = self.limits.joints_rad[name]
             targets[name] = min(max(value, low), high)
 
     # -- places
-    def _workspace(self, targets: Targets, motion: _Motion, problems: list[str]) -> None:
+    def _workspace(self, targets: Targets, motion: _Motion, problems: list[Violation]) -> None:
         """Check the target and the way half there.
 
         A robot that is already outside may come back in.
@@ -405,17 +411,17 @@ class RobotGate:
             self._tool_is_inside(points["tool"], now["tool"], problems)
             self._zones_are_free(points, now, problems)
 
-    def _tool_is_inside(self, tool: Vector3, now: Vector3, problems: list[str]) -> None:
+    def _tool_is_inside(self, tool: Vector3, now: Vector3, problems: list[Violation]) -> None:
         outside = outside_m(self.limits.box, tool)
         if outside <= EPSILON:
             return
         said = f"the tool at {_place(tool)} m is {outside * 1e3:.0f} mm outside the workspace"
         if outside >= outside_m(self.limits.box, now) - EPSILON:
-            raise _Withheld(said)
-        problems.append(f"{said}, on its way back")
+            raise SafetyViolation("workspace", said)
+        problems.append(Violation("workspace", f"{said}, on its way back"))
 
     def _zones_are_free(
-        self, points: Mapping[str, Vector3], now: Mapping[str, Vector3], problems: list[str]
+        self, points: Mapping[str, Vector3], now: Mapping[str, Vector3], problems: list[Violation]
     ) -> None:
         for index, zone in enumerate(self.limits.zones):
             for name, point in points.items():
@@ -426,12 +432,12 @@ class RobotGate:
                     f"the {name} at {_place(point)} m is inside the no-go zone {zone.name or index}"
                 )
                 if depth >= zone.depth_m(now[name]) - EPSILON:
-                    raise _Withheld(said)
-                problems.append(f"{said}, on its way out")
+                    raise SafetyViolation("no_go_zone", said)
+                problems.append(Violation("no_go_zone", f"{said}, on its way out"))
 
     def _tool(self, joints: Mapping[str, float]) -> Vector3:
         if self._kinematics is None:
-            raise _Withheld("this robot has no kinematics")
+            raise SafetyViolation("form", "this robot has no kinematics")
         return self._kinematics.points(joints)["tool"]
 
 

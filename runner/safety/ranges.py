@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from vram_arbiter.runner.safety.violations import Check, Violation
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.world import Action, WorldState
 
@@ -25,31 +26,34 @@ class JointRanges:
     joint_limits: Mapping[str, tuple[float, float]]
     clamp_tolerance_rad: float = CLAMP_TOLERANCE_RAD
 
-    def check(self, action: Action, world: WorldState) -> tuple[Action | None, tuple[str, ...]]:
+    def check(
+        self, action: Action, world: WorldState
+    ) -> tuple[Action | None, tuple[Violation, ...]]:
         """Return the action to apply, clamped where the excess is tolerable, or None; and the
         violations.
         """
         if "joint_state" in world.stale:
-            return None, ("the joint state is stale",)
+            return _withheld("freshness", "the joint state is stale")
         if action.control_mode is not ControlMode.JOINT_POSITION:
-            return None, (f"control mode {action.control_mode} is not supported here",)
+            return _withheld("form", f"control mode {action.control_mode} is not supported here")
         names = action.joint_names or tuple(self.joint_limits)
         rows, problems, withheld = [], [], False
         for row in action.joint_targets or ():
             if len(row) != len(names):
-                return None, (f"{len(row)} joint targets for {len(names)} joints",)
+                return _withheld("form", f"{len(row)} joint targets for {len(names)} joints")
             values = []
             for name, value in zip(names, row, strict=True):
                 if name not in self.joint_limits:
-                    return None, (f"unknown joint {name}",)
+                    return _withheld("form", f"unknown joint {name}")
                 if not math.isfinite(value):  # of a copy that was not validated
-                    return None, (f"{name}: expected a number of rad, got {value}",)
+                    return _withheld("form", f"{name}: expected a number of rad, got {value}")
                 low, high = self.joint_limits[name]
                 excess = max(low - value, value - high, 0.0)
                 if excess > 0:
-                    problems.append(
+                    said = (
                         f"{name}: {value:.3f} rad is {excess:.3f} outside [{low:.3f}, {high:.3f}]"
                     )
+                    problems.append(Violation("joint_range", said))
                     withheld |= excess > self.clamp_tolerance_rad
                 values.append(min(max(value, low), high))
             rows.append(tuple(values))
@@ -58,3 +62,7 @@ class JointRanges:
         if problems:
             action = action.model_copy(update={"joint_targets": tuple(rows)})
         return action, tuple(problems)
+
+
+def _withheld(check: Check, text: str) -> tuple[None, tuple[Violation, ...]]:
+    return None, (Violation(check, text),)

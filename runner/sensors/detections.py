@@ -14,11 +14,7 @@ from collections.abc import Sequence
 from vram_arbiter.schemas.plain import JsonObject
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
-from vram_arbiter.schemas.world import DetectedObject
-
-COMPONENT = "detector:"
-"""Prefix of a detector's name among the components of the world state; its camera's name follows.
-"""
+from vram_arbiter.schemas.world import DETECTOR_PREFIX, DetectedObject
 
 
 class DetectionSlot:
@@ -26,7 +22,7 @@ class DetectionSlot:
 
     def __init__(self, sensor_id: str, max_age_ms: float) -> None:
         self.sensor_id = sensor_id
-        self.name = COMPONENT + sensor_id
+        self.name = DETECTOR_PREFIX + sensor_id
         self.max_age_s = max_age_ms / 1e3
         self._lock = threading.Lock()
         self._objects: tuple[DetectedObject, ...] | None = None

@@ -1,9 +1,10 @@
 """World state: joint state, camera frames and detections, each fresh or marked as stale.
 
-Fails closed. A component older than its limit is `stale` in `diagnostics`, a stale camera's frame
-is missing from `image_frames`, and both stay so (latched) until RECOVERY_UPDATES fresh values have
-come in a row: a camera that flickers must not make the arm jerk. Nothing is filled in: without any
-joint state there is no world state. Must not know sensors or robots; any thread may call it.
+Fails closed. A component older than its limit is `stale` in `diagnostics`, one whose source failed
+is `error`. A camera's frame is then missing from `image_frames`, and both stay so (latched) until
+RECOVERY_UPDATES fresh values have come in a row: a camera that flickers must not make the arm jerk.
+Nothing is filled in: without any joint state there is no world state. Must not know sensors or
+robots; any thread may call it.
 """
 
 from __future__ import annotations
@@ -14,6 +15,9 @@ from dataclasses import dataclass
 
 from vram_arbiter.runner.sensors.detections import DetectionSlot
 from vram_arbiter.schemas.errors import StateStale
+from vram_arbiter.schemas.runtime.telemetry import meters
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.world import (
     DetectedObject,
     Diagnostic,
@@ -29,6 +33,7 @@ RECOVERY_UPDATES = 3
 FUTURE_TOLERANCE_MS = 5.0  # a stamp further ahead is of another clock, and its age unknown
 # share of a period by which a caller may be early and still be on the cadence: ticks jitter
 EARLY = 0.25
+_LATCHED = {"stale": telemetry.EVENT_STALE, "error": telemetry.EVENT_ERROR}
 
 
 @dataclass(slots=True)
@@ -36,6 +41,7 @@ class _Component:
     max_age_ns: int
     stamp_ns: int | None = None
     latched: bool = False
+    failed: bool = False  # while latched: its source failed, beyond being late
     fresh_in_a_row: int = 0
     why: str = "nothing has come from it yet"
     note: str = ""  # why its last update failed, while it lives on the value before
@@ -48,10 +54,10 @@ class _Component:
             self.fresh_in_a_row = 0
             return
         ages = f"{age_ns / 1e6:.0f} ms old, {self.max_age_ns / 1e6:.0f} ms are accepted"
-        self.latch(f"{self.note} ({ages})" if self.note else ages)
+        self.latch(f"{self.note} ({ages})" if self.note else ages, failed=bool(self.note))
 
-    def latch(self, why: str) -> None:
-        self.latched, self.fresh_in_a_row, self.why = True, 0, why
+    def latch(self, why: str, *, failed: bool = False) -> None:
+        self.latched, self.failed, self.fresh_in_a_row, self.why = True, failed, 0, why
 
     def update(self, stamp_ns: int, now_ns: int) -> bool:
         """Take the stamp of an update. Returns whether its value is new and may be kept.
@@ -79,8 +85,10 @@ class _Component:
         return True
 
     @property
-    def stale(self) -> bool:
-        return self.latched or self.stamp_ns is None
+    def diagnostic(self) -> Diagnostic:
+        if self.latched:
+            return "error" if self.failed else "stale"
+        return "stale" if self.stamp_ns is None else "ok"
 
 
 class WorldStateAggregator:
@@ -108,6 +116,7 @@ class WorldStateAggregator:
         self._next_ns: int | None = None
         self._joint_state: JointState | None = None
         self._frames: dict[str, SensorFrame] = {}
+        self._told: dict[str, Diagnostic] = {}  # of the snapshot before
         self._lock = threading.Lock()
 
     def due(self, now_ns: int) -> bool:
@@ -137,10 +146,12 @@ class WorldStateAggregator:
             if self._components[frame.sensor_id].update(frame.stamp_monotonic_ns, now_ns):
                 self._frames[frame.sensor_id] = frame
 
-    def lose(self, name: str, why: str) -> None:
-        """Mark a component as stale from now on, whatever its last value's age."""
+    def lose(self, name: str, why: str, *, failed: bool = False) -> None:
+        """Mark a component as stale from now on, whatever its last value's age; `failed`: as an
+        error.
+        """
         with self._lock:
-            self._components[name].latch(why)
+            self._components[name].latch(why, failed=failed)
 
     def note(self, name: str, why: str) -> None:
         """Note a failed update. The last value stands until it is too old; then this is the
@@ -154,7 +165,10 @@ class WorldStateAggregator:
 
     # -- what comes out
     def snapshot(self, now_ns: int) -> WorldState:
-        """Everything as of now. Raises StateStale when no joint state has ever come."""
+        """Everything as of now. A component that has just latched is an event of the present span.
+
+        Raises StateStale when no joint state has ever come.
+        """
         with self._lock:
             if self._joint_state is None:
                 raise StateStale(
@@ -164,14 +178,20 @@ class WorldStateAggregator:
             diagnostics: dict[str, Diagnostic] = {}
             for name, component in self._components.items():
                 component.judge(now_ns)
-                diagnostics[name] = "stale" if component.stale else "ok"
-                if component.stale:
+                diagnostics[name] = component.diagnostic
+                if component.diagnostic != "ok":
                     self._frames.pop(name, None)
+                if component.stamp_ns is not None:
+                    age_s = (now_ns - component.stamp_ns) / 1e9
+                    meters.measure(
+                        telemetry.METRIC_STALENESS, age_s, {telemetry.ATTR_COMPONENT: name}
+                    )
             detected: list[DetectedObject] = []
             for slot in self._detections:
                 found = slot.fresh(now_ns)
                 diagnostics[slot.name] = "stale" if found is None else "ok"
                 detected += found or ()
+            self._tell(diagnostics)
             return WorldState(
                 stamp_ns=now_ns,
                 joint_state=self._joint_state,
@@ -180,6 +200,23 @@ class WorldStateAggregator:
                 detected_objects=tuple(detected),
                 diagnostics=diagnostics,
             )
+
+    def _tell(self, diagnostics: dict[str, Diagnostic]) -> None:
+        """Report the components that have changed since the snapshot before."""
+        for name, said in diagnostics.items():
+            before = self._told.get(name)
+            if said == before:
+                continue
+            bad, was_bad = said in _LATCHED, before in _LATCHED
+            labels = {telemetry.ATTR_COMPONENT: name}
+            meters.shift(telemetry.METRIC_COMPONENTS_STALE, bad - was_bad, labels)
+            if bad:
+                tracing.event(_LATCHED[said], component=name, reason=self._reason(name))
+        self._told = diagnostics
+
+    def _reason(self, name: str) -> str:
+        slots = {slot.name: slot for slot in self._detections}
+        return slots[name].why if name in slots else self._components[name].why
 
     def why(self, name: str) -> str:
         """Return why a component is stale, or was last."""

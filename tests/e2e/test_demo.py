@@ -74,9 +74,11 @@ class Watched:
 
     def __init__(self) -> None:
         self.page = self.screen = b""
+        self.printed = ""
 
     def line(self, printed: str) -> None:
         """Do what a line of the demo says: open the page, type the command."""
+        self.printed += printed
         if printed.startswith("status page: "):
             with urllib.request.urlopen(printed.split()[-1], timeout=60.0) as answer:
                 self.page = answer.read()
@@ -101,6 +103,11 @@ def test_find_navigate_grab_fits_in_eight_gib(tmp_path: Path) -> None:
     assert grab["evicted"] == ["detector"], "the detector fits beside neither of the others"
     vlm = [load for load in summary["loads"] if load["consumer"] == "scene-vlm"][-1]
     assert vlm["evicted"] == [], "scene VLM and policy fit together and must not evict each other"
+    back = summary["detector_back"]
+    assert summary["detector_resident"]
+    assert back["verdict"] == "verified"
+    assert back["reason"] == "back from standby: there is room and nothing waits"
+    assert f"the detector is back by itself, {back['after_s']} s after" in watched.printed
     assert (tmp_path / "on" / "timeline.png").read_bytes().startswith(b"\x89PNG")
     assert b"ftyp" in (tmp_path / "on" / "episode.mp4").read_bytes()[:64]
 

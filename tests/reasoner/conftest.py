@@ -42,6 +42,7 @@ class Runner:
         self.estop: str | None = None
         self.skills: list[dict[str, Any]] = []
         self.diagnostics: dict[str, str] = {}
+        self.world: Message = {}
         self.frame_error: VramError | None = None
         self.frames: list[GetFrame] = []
         self.frame_data = PNG
@@ -135,7 +136,7 @@ class Runner:
                     "goal": self.goal.goal_id if self.goal else None,
                     "phase": "idle",
                     "estop": self.estop,
-                    "world": {"diagnostics": dict(self.diagnostics)},
+                    "world": {"diagnostics": dict(self.diagnostics)} | self.world,
                     "session": SESSION,
                 }
             case GetSkills():

@@ -11,7 +11,7 @@ import pytest
 from vram_arbiter.reasoner.llm.scripted import PLACES_MAX, ScriptedPlanner, object_of
 from vram_arbiter.reasoner.loop import REPEATS_MAX, Result, run_episode
 from vram_arbiter.reasoner.palette import OPERATOR, Palette, Skill
-from vram_arbiter.reasoner.planner import Episode, Finish, Outcome
+from vram_arbiter.reasoner.planner import Episode, Finish, Outcome, Seen, Sight
 from vram_arbiter.reasoner.search_map import VIEWPOINTS_M
 from vram_arbiter.schemas.errors import BadRequest, LlmError, UnknownSkill
 from vram_arbiter.schemas.tools import ExecuteRskill, LocateInView, QueryScene, ToolCall
@@ -51,7 +51,10 @@ def saying(look: Told = FOUND, answer: Told = YES, grab: Told = DONE, other: Tol
 
 
 def run_script(
-    world: World, palette: Palette = PALETTE, hand: str | None = None
+    world: World,
+    palette: Palette = PALETTE,
+    hand: str | None = None,
+    sight: Sight | None = None,
 ) -> tuple[Result, list[ToolCall]]:
     """Run the script against a world that answers (call, how many calls of this tool came
     before). The hand is empty at first; with `hand` the world says what is in it.
@@ -63,8 +66,12 @@ def run_script(
         calls.append(call)
         return EMPTY if len(calls) == 1 and hand is None else world(call, before)
 
+    async def look_at() -> Sight | None:
+        return sight
+
     planner = ScriptedPlanner("grab the red cube", palette)
-    return asyncio.run(run_episode("grab the red cube", planner, palette, dispatch)), calls
+    episode = run_episode("grab the red cube", planner, palette, dispatch, look_at=look_at)
+    return asyncio.run(episode), calls
 
 
 def test_finds_drives_corrects_grabs_and_asks() -> None:
@@ -86,6 +93,39 @@ def test_finds_drives_corrects_grabs_and_asks() -> None:
     assert result["status"] == "success"
     assert result["attempts"] == 1
     assert result["vlm_confirmed"]
+
+
+CAMERAS = dataclasses.replace(PALETTE, cameras=("front", "rear"))
+
+
+def cameras_of(calls: list[ToolCall]) -> list[str]:
+    return [call.camera for call in calls if isinstance(call, LocateInView)]
+
+
+def test_it_looks_first_where_a_continuous_detector_sees_the_thing() -> None:
+    seen = (Seen("blue ball", 0.99, "front", 0.1), Seen("Red cube", 0.8, "rear", 0.4))
+    result, calls = run_script(saying(), CAMERAS, sight=Sight(seen))
+    assert result["status"] == "success"
+    assert cameras_of(calls) == ["rear", "rear"]
+    unsure = (Seen("red cube", 0.3, "front", 0.2), *seen)
+    assert cameras_of(run_script(saying(), CAMERAS, sight=Sight(unsure))[1])[0] == "rear"
+
+
+def test_what_gives_no_place_there_is_looked_for_by_the_default_camera() -> None:
+    def only_in_front(call: Any, before: int) -> Outcome:
+        return FOUND if not call.camera else Outcome("not_seen", "", data={"base_pose": [0, 0, 0]})
+
+    sight = Sight((Seen("red cube", 0.8, "rear", 0.4),))
+    result, calls = run_script(saying(only_in_front), CAMERAS, sight=sight)
+    assert result["status"] == "success"
+    assert cameras_of(calls) == ["rear", "", "rear", ""]
+    turns = [call for call in calls if "turn_rad" in call.model_dump_json()]
+    assert turns == [], "it is in view"
+
+
+@pytest.mark.parametrize("sight", [None, Sight(()), Sight((), blind=("rear",))])
+def test_without_a_fresh_detection_it_looks_as_ever(sight: Sight | None) -> None:
+    assert cameras_of(run_script(saying(), CAMERAS, sight=sight)[1]) == ["", ""]
 
 
 def test_retries_at_most_three_times() -> None:

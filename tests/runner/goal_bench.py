@@ -27,12 +27,14 @@ class Told(SkillBase):
     def __init__(self, manifest: RSkillManifest) -> None:
         super().__init__(manifest)
         self.story: list[str] = []
+        self.traceparents: list[str] = []
         self.begun = asyncio.Event()
         self.finishing, self.finished = asyncio.Event(), asyncio.Event()
         self.loop = asyncio.get_running_loop()
 
     async def _start(self, goal: Goal) -> None:
         self.story.append(f"start {goal.prompt}")
+        self.traceparents.append(goal.traceparent or "")
         self.todo = goal.prompt
         self.steps = 0
         self.begun.clear()

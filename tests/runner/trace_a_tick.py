@@ -98,7 +98,7 @@ def main() -> None:
             "trace_id": f"{span.context.trace_id:032x}",
             "span_id": f"{span.context.span_id:016x}",
             "parent": f"{span.parent.span_id:016x}" if span.parent else None,
-            "events": [event.name for event in span.events],
+            "events": [[event.name, dict(event.attributes or {})] for event in span.events],
             "kind": span.kind.name,
             "attributes": dict(span.attributes or {}),
         }
@@ -107,7 +107,14 @@ def main() -> None:
     said = {"spans": spans, "tick": result.trace_context, "run": runner.result().trace_id}
     said["metrics"] = collected(reader)
     said["pages"] = [ready, moving, generate_latest(registry).decode()]
+    exporter.clear()
     fall_behind(clock)
+    said["slow"] = [
+        [span.name, event.name, dict(event.attributes or {})]
+        for span in exporter.get_finished_spans()
+        for event in span.events
+    ]
+    said["metrics_of_slow"] = collected(reader)
     look_in_vain(clock)
     said["pages"].append(generate_latest(registry).decode())
     exporter.clear()
@@ -163,7 +170,7 @@ class Slow(Nod):
 
 
 def fall_behind(clock: ManualClock) -> None:
-    twin, camera = Twin(clock), FedCamera("wrist", clock)
+    twin, camera = Twin(clock), FedCamera("wrist", clock, 1000.0)
     limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
     runner = hardware_runner(
         twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock
@@ -171,8 +178,12 @@ def fall_behind(clock: ManualClock) -> None:
     runner.activate()
     skill = Slow(load_manifest(Path(sys.argv[1])), on_step=lambda world: clock.advance(0.05))
     skill.state = SkillState.ACTIVE
-    runner.begin_skill(skill, Goal("h", "a/slow"), lambda ended: None)
+    runner.begin_skill(skill, Goal("h", "a/slow", traceparent=sys.argv[2]), lambda ended: None)
     runner.run(4)
+    camera.always = False  # it hangs
+    clock.advance(2.0)
+    twin.silent = True
+    runner.run(2)
     runner.deactivate()
 
 

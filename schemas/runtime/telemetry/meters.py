@@ -25,6 +25,11 @@ def count(name: str, labels: Labels | None = None, times: int = 1) -> None:
     _counter(name).add(times, exported.labels(labels))
 
 
+def shift(name: str, by: int, labels: Labels | None = None) -> None:
+    """A level changed by so much; 0 makes its series known."""
+    _level(name).add(by, exported.labels(labels))
+
+
 def measure(name: str, value: float, labels: Labels | None = None) -> None:
     """One value of a distribution, in the unit of its name. What is no number, or negative, is no
     measurement and left out."""
@@ -38,14 +43,18 @@ def _counter(name: str) -> metrics.Counter:
 
 
 @cache
+def _level(name: str) -> metrics.UpDownCounter:
+    return _METER.create_up_down_counter(name, *INSTRUMENTS[name][:2])
+
+
+@cache
 def _histogram(name: str) -> metrics.Histogram:
     return new_histogram(_METER, name)
 
 
 def new_counter(meter: metrics.Meter, name: str) -> metrics.Counter:
     """Create a counter as the catalogue describes it."""
-    unit, description, _ = INSTRUMENTS[name]
-    return meter.create_counter(name, unit, description)
+    return meter.create_counter(name, *INSTRUMENTS[name][:2])
 
 
 def new_histogram(meter: metrics.Meter, name: str) -> metrics.Histogram:

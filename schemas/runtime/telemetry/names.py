@@ -22,6 +22,7 @@ SPAN_GOAL = "rskill.goal"
 SPAN_ACTIVATE = "rskill.activate"
 SPAN_TICK = "rskill.tick"
 SPAN_SENSORS = "sensors.read"
+SPAN_READ = "hal.read_state"
 SPAN_WORLD = "world_state.snapshot"
 SPAN_INFERENCE = "inference"
 SPAN_CHUNK = "rskill.chunk_inference"
@@ -42,6 +43,9 @@ SPAN_SIDECAR_REQUEST = "sidecar.request"
 EVENT_DEADLINE_MISSED = "vram.event.deadline_missed"
 EVENT_ESTOP = "vram.event.estop_requested"
 EVENT_STALE = "vram.event.staleness_latched"
+EVENT_ERROR = "vram.event.error_latched"
+EVENT_SENSOR_STALE = "vram.event.sensor_stale"
+EVENT_SAFETY_VIOLATION = "vram.event.safety_violation"
 EVENT_ACTION_WITHHELD = "vram.event.action_withheld"
 EVENT_ANSWER_REJECTED = "vram.event.answer_rejected"  # within reasoner.plan: asked again
 EVENT_PREFETCH_HIT = "vram.event.chunk_prefetch_hit"
@@ -74,46 +78,24 @@ def metric(name: str, unit: str, description: str, bounds: tuple[float, ...] = (
 
 
 METRIC_TICK = metric("vram_runner.tick.duration", "s", "One tick of the control loop", TICKS_S)
-METRIC_INFERENCE = metric(
-    "vram_runner.inference.duration", "s", "One question to the active skill", TICKS_S
-)
-METRIC_CHUNK = metric(
-    "vram_runner.chunk.duration", "s", "From the request of a policy's chunk to its answer", WAITS_S
-)
-METRIC_PREFETCH = metric(
-    "vram_runner.chunk.prefetches", "{chunk}", "Chunks that were, or were not, there in time"
-)
-METRIC_STANDING = metric(
-    "vram_runner.chunk.standing_steps", "{step}", "Steps of a motion without an action to play"
-)
-METRIC_START_LATE = metric(
-    "vram_runner.tick.start_delay", "s", "How far behind its slot a goal's tick began", TICKS_S
-)
-METRIC_DEADLINE_MISSES = metric(
-    "vram_runner.tick.deadline_misses", "{tick}", "Ticks longer than their time budget"
-)
-METRIC_HAL_READ = metric(
-    "vram_runner.hal.read.duration", "s", "One reading of the robot's joint state", TICKS_S
-)
-METRIC_HAL_SEND = metric(
-    "vram_runner.hal.send.duration", "s", "One action sent to the motors", TICKS_S
-)
-METRIC_SENSOR_AGE = metric(
-    "vram_runner.sensor.age", "s", "Age of the newest value when a tick reads it", TICKS_S
-)
-METRIC_STALE_READS = metric(
-    "vram_runner.sensor.stale_reads", "{read}", "Reads that gave no fresh value"
-)
-METRIC_WORLD_STALE = metric(
-    "vram_runner.world.stale_states", "{state}", "World states with a stale component"
+METRIC_INFERENCE = metric("vram_runner.inference.duration", "s", "One request to a skill", TICKS_S)
+METRIC_CHUNK = metric("vram_runner.chunk.duration", "s", "A chunk's request to its answer", WAITS_S)
+METRIC_PREFETCH = metric("vram_runner.chunk.prefetches", "{chunk}", "Chunks, in time or too late")
+METRIC_STANDING = metric("vram_runner.chunk.standing_steps", "{step}", "Steps without an action")
+METRIC_START_LATE = metric("vram_runner.tick.start_delay", "s", "Late start of a tick", TICKS_S)
+METRIC_DEADLINE_MISSES = metric("vram_runner.tick.deadline_misses", "{tick}", "Ticks over too late")
+METRIC_BUDGET_VIOLATIONS = metric("vram_runner.tick.budget_violations", "{tick}", "Overlong ticks")
+METRIC_HAL_READ = metric("vram_runner.hal.read.duration", "s", "One reading of the joints", TICKS_S)
+METRIC_HAL_SEND = metric("vram_runner.hal.send.duration", "s", "One action to the motors", TICKS_S)
+METRIC_SENSOR_AGE = metric("vram_runner.sensor.age", "s", "Age of what a tick reads", TICKS_S)
+METRIC_STALE_READS = metric("vram_runner.sensor.stale_reads", "{read}", "Reads without fresh value")
+METRIC_STALENESS = metric("vram_runner.world.staleness", "s", "Age within a world state", TICKS_S)
+METRIC_COMPONENTS_STALE = metric(
+    "vram_runner.world.components_stale", "{component}", "Components not to be trusted now"
 )
 METRIC_ESTOPS = metric("vram_runner.estops", "{stop}", "Emergency stops")
-METRIC_SAFETY_VIOLATIONS = metric(
-    "vram_runner.safety.violations", "{violation}", "Reports of the safety gate"
-)
-METRIC_WITHHELD = metric(
-    "vram_runner.safety.withheld_actions", "{action}", "Actions that were not sent to the motors"
-)
+METRIC_SAFETY_VIOLATIONS = metric("vram_runner.safety.violations", "{violation}", "Gate reports")
+METRIC_WITHHELD = metric("vram_runner.safety.withheld_actions", "{action}", "Actions not sent")
 METRIC_LOOKS = metric("vram_runner.detector.looks", "{look}", "Looks of continuous detectors")
 METRIC_STALE_DETECTIONS = metric(
     "vram_runner.detector.stale_answers", "{answer}", "Detections that became too old"
@@ -121,12 +103,8 @@ METRIC_STALE_DETECTIONS = metric(
 METRIC_GOALS = metric("vram_runner.goals", "{goal}", "Goals that ended")
 METRIC_GPU_MEMORY = metric("vram_runner.gpu.memory.usage", "By", "GPU memory of this process")
 METRIC_TOOL_CALLS = metric("vram_reasoner.tool_calls", "{call}", "Tool calls of the reasoner")
-METRIC_SIDECAR_LOAD = metric(
-    "vram_sidecar.load.duration", "s", "One load of a model onto the GPU", WAITS_S
-)
-METRIC_SIDECAR_REQUEST = metric(
-    "vram_sidecar.request.duration", "s", "One request to a sidecar", TICKS_S
-)
+METRIC_SIDECAR_LOAD = metric("vram_sidecar.load.duration", "s", "One load onto the GPU", WAITS_S)
+METRIC_SIDECAR_REQUEST = metric("vram_sidecar.request.duration", "s", "One request", TICKS_S)
 METRIC_CPU_TIME = metric("process.cpu.time", "s", "CPU time of this process")
 METRIC_MEMORY = metric("process.memory.usage", "By", "RAM of this process")
 
@@ -145,6 +123,8 @@ ATTR_SENSOR = "vram.sensor"
 ATTR_OPERATION = "sidecar.operation"
 ATTR_OUTCOME = "outcome"
 ATTR_COMPONENT = "vram.component"  # of the world state: a sensor, joint_state, a detector
+ATTR_CHECK = "safety.check_name"  # a `Check` of runner.safety.violations
+ATTR_SEVERITY = "safety.severity"  # error: the action was withheld; warning: it was shortened
 ATTR_CPU_MODE = "cpu.mode"
 ATTR_ERROR_TYPE = "error.type"  # a code of schemas.errors, or an exception's class
 ATTR_EXCEPTION_TYPE = "exception.type"  # of log records, as OpenTelemetry's conventions say

@@ -37,6 +37,9 @@ FLUSH_S = 5.0
 """Longest wait for a collector at a program's end."""
 EXPORT_S = 3.0
 """Time limit of one OTLP export unless a variable sets it; the SDK's 10 s outlast FLUSH_S."""
+INTERVAL_MS = 5000.0
+"""Between two exports of metrics unless OTEL_METRIC_EXPORT_INTERVAL is set; the SDK's 60 s hide
+what happens within a goal."""
 HINT = "pip install 'vram-arbiter[telemetry]', or correct the OTEL_ variables that are set"
 SAY_AGAIN_S = 300.0
 """Interval between two complaints about a collector that is away."""
@@ -181,7 +184,9 @@ def _meters(names: Sequence[str], readers: Sequence[Any], resource: Any, ends: _
     from opentelemetry.sdk.metrics.export import PeriodicExportingMetricReader
 
     exporters = [_exporter("metrics", name) for name in names if name != PROMETHEUS]
-    every = [*readers, *map(PeriodicExportingMetricReader, exporters)]
+    given = os.environ.get("OTEL_METRIC_EXPORT_INTERVAL", "").strip()
+    interval_ms = None if given else INTERVAL_MS  # None: the SDK reads it
+    every = [*readers, *(PeriodicExportingMetricReader(one, interval_ms) for one in exporters)]
     if not every:
         return None
     made = MeterProvider(every, resource=resource, shutdown_on_exit=False)
@@ -240,9 +245,8 @@ def _prometheus(ends: _Ends, *, port_required: bool) -> Sequence[Any]:
     from prometheus_client import CollectorRegistry, start_http_server
 
     host = os.environ.get("OTEL_EXPORTER_PROMETHEUS_HOST", "").strip() or "127.0.0.1"
-    port = (
-        os.environ.get("OTEL_EXPORTER_PROMETHEUS_PORT", "").strip() or "9464"
-    )  # of the specification
+    # 9464 is the specification's
+    port = os.environ.get("OTEL_EXPORTER_PROMETHEUS_PORT", "").strip() or "9464"
     address = http_address(f"[{host}]:{port}" if ":" in host else f"{host}:{port}")
     if not address.loopback:
         raise ConfigError(

@@ -167,6 +167,13 @@ def event(name: str, **attributes: str | float) -> None:
     trace.get_current_span().add_event(name, attributes)
 
 
+def refused(error: Exception, attributes: Attributes) -> None:
+    """Record an error in the present span that no exception carries through it."""
+    present = trace.get_current_span()
+    present.record_exception(error, dict(attributes))
+    failed(present, error_type(error))
+
+
 def note(attributes: Attributes) -> None:
     """Add attributes to the present span."""
     trace.get_current_span().set_attributes(dict(attributes))

@@ -12,6 +12,7 @@ from vram_arbiter.clients.cli.demo_report import (
     Point,
     draw_timeline,
     read_log,
+    returned,
     summarise,
 )
 
@@ -42,6 +43,7 @@ def demo_summary(**changes: Any) -> dict[str, Any]:
         "seed": 3, "arbiter": True, "task": "grab the red cube", "story": story,
         "capacity_bytes": 8 * GIB, "events": [LOAD, SWITCH],
         "reasoner": SUCCESS, "truth": HELD, "target": "red cube", "seconds": 61.23,
+        "detector_resident": True,
     }  # fmt: skip
     return summarise(**(given | changes))
 
@@ -84,6 +86,23 @@ def test_switches_are_counted_apart_from_loads_beside_others() -> None:
         "total_ms": 15.0,
     }  # fmt: skip
     assert demo_summary(events=[SWITCH | {"verified": False}])["switches_verified"] == 0
+
+
+def test_the_detector_returns_after_the_grabs_bytes_are_measured_gone() -> None:
+    told = [
+        {"kind": "use_ended", "consumer": "grab"},
+        {"kind": "verified", "consumer": "grab", "verdict": "verified"},
+        {"kind": "granted", "consumer": "detector", "reason": "there is room"},
+        {"kind": "ready", "consumer": "detector"},
+    ]
+    events = [one | {"seq": n, "at_wall_s": 100.0 + n} for n, one in enumerate(told)]
+    back = {"after_s": 3.0, "reason": "there is room", "verdict": "verified"}
+    assert demo_summary(events=events)["detector_back"] == back
+    failed = [events[0] | {"kind": "granted"}, *events[1:]]
+    assert returned(failed) == back, "its model did not load"
+    assert returned(events[:-1]) is None, "its model is not loaded yet"
+    before = [events[-2] | {"seq": -2}, events[-1] | {"seq": -1}, *events[:2]]
+    assert returned(before) is None, "that was before the grab"
 
 
 def test_events_read_as_sentences() -> None:

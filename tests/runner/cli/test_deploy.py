@@ -183,7 +183,7 @@ async def test_a_camera_file_that_ends_withholds_and_fails_the_goal(
         result = await goal.result(60)
         assert (result["status"], result["code"]) == ("failed", "frame_stale")
         assert result["data"]["withheld"] > 0
-        assert (await client.state())["world"]["diagnostics"]["front"] == "stale"
+        assert (await client.state())["world"]["diagnostics"]["front"] == "error"
 
 
 async def test_the_emergency_stop_of_a_real_process(start: Start, tmp_path: Path) -> None:

@@ -45,11 +45,65 @@ def test_each_stage_of_a_tick_is_a_span_of_the_goals_trace(outcome: Any) -> None
     ]
     assert outcome["tick"]["traceparent"] == f"00-{TRACE}-{first['span_id']}-01"
     assert outcome["run"] == TRACE
-    events = [event for span in later for event in span["events"]]  # its camera is gone
-    assert events[:2] == [telemetry.EVENT_STALE, telemetry.EVENT_ACTION_WITHHELD]
-    assert events.count(telemetry.EVENT_STALE) == 1
+    sensed = [span["span_id"] for span in spans if span["name"] == telemetry.SPAN_SENSORS]
+    read = [span for span in spans if span["name"] == telemetry.SPAN_READ]
+    assert [span["parent"] for span in read] == sensed
+    assert read[-1]["attributes"] == {"error.type": "robot_fault"}
+    told = [name for span in later for name, _ in span["events"]]  # its camera is gone
+    assert told[0] == telemetry.EVENT_ACTION_WITHHELD
     check_metrics(outcome["metrics"])
     check_dashboard(*(promql.scrape(page) for page in outcome["pages"]))
+
+
+def test_what_cannot_be_trusted_is_an_event_of_the_first_tick(outcome: Any) -> None:
+    """By the world state, whether a skill needs it or not; each failed reading is one of its own.
+    What is too old is told from what failed."""
+    ended = [
+        (name, about["component"])
+        for span in outcome["spans"]
+        if span["name"] == telemetry.SPAN_WORLD
+        for name, about in span["events"]
+    ]
+    assert ended == [(telemetry.EVENT_ERROR, "front")]
+    latched = [
+        (name, about["component"])
+        for span, name, about in outcome["slow"]
+        if span == telemetry.SPAN_WORLD
+    ]
+    assert latched == [(telemetry.EVENT_STALE, "wrist"), (telemetry.EVENT_ERROR, "joint_state")]
+    missed = [
+        (name, about["sensor"], about["reason"])
+        for span, name, about in outcome["slow"]
+        if span == telemetry.SPAN_SENSORS
+    ]
+    assert [(name, sensor) for name, sensor, _ in missed] == [
+        (telemetry.EVENT_SENSOR_STALE, "wrist"),
+        (telemetry.EVENT_SENSOR_STALE, "joint_state"),
+    ] * 2
+    assert "2067 ms old" in missed[0][2]
+    points = outcome["metrics_of_slow"][telemetry.METRIC_COMPONENTS_STALE]["points"]
+    assert {p["labels"][telemetry.ATTR_COMPONENT]: p["count"] for p in points} == {
+        "front": 1,
+        "wrist": 1,
+        "joint_state": 1,
+    }
+    ages = outcome["metrics_of_slow"][telemetry.METRIC_STALENESS]["points"]
+    (wrist,) = [p for p in ages if p["labels"][telemetry.ATTR_COMPONENT] == "wrist"]
+    assert wrist["sum"] > 4.0
+
+
+def test_a_violation_names_its_check_and_severity(outcome: Any) -> None:
+    """As an event, as the recorded exception of a refusal, and as labels of the counter."""
+    about = {telemetry.ATTR_CHECK: "joint_range", telemetry.ATTR_SEVERITY: "error"}
+    told = [event[1:] for event in outcome["slow"] if event[0] == telemetry.SPAN_SAFETY]
+    assert [name for name, _ in told] == [telemetry.EVENT_SAFETY_VIOLATION, "exception"] * 2
+    (_, event), (_, recorded), *_ = told
+    assert about.items() <= event.items()
+    assert "9.000 rad is 7.342 outside" in event["reason"]
+    assert about.items() <= recorded.items()
+    assert recorded["exception.type"].endswith(".SafetyViolation")
+    (point,) = outcome["metrics_of_slow"][telemetry.METRIC_SAFETY_VIOLATIONS]["points"]
+    assert (point["labels"], point["count"]) == ({telemetry.ATTR_SKILL: "a/slow", **about}, 2)
 
 
 def check_dashboard(*pages: promql.Scrape) -> None:
@@ -106,7 +160,10 @@ def check_metrics(metrics: dict[str, Any]) -> None:
     }
     stale = {"front": 3, "joint_state": 2}
     assert counts(telemetry.METRIC_STALE_READS, telemetry.ATTR_SENSOR) == stale
-    assert counts(telemetry.METRIC_WORLD_STALE, telemetry.ATTR_COMPONENT)["front"] >= 3
+    assert counts(telemetry.METRIC_COMPONENTS_STALE, telemetry.ATTR_COMPONENT) == {
+        "front": 1,
+        "joint_state": 0,
+    }
     assert counts(telemetry.METRIC_ESTOPS, "") == {None: 1}
     assert set(counts(telemetry.METRIC_CPU_TIME, telemetry.ATTR_CPU_MODE)) == {"user", "system"}
     assert counts(telemetry.METRIC_MEMORY, "")[None] > 1_000_000

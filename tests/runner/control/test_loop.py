@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from tests.runner.manual_clock import ManualClock
 from vram_arbiter.runner.control.loop import ControlLoop
 from vram_arbiter.runner.control.robot import Applied, Sensed
 from vram_arbiter.runner.control.timings import Timings, percentile
@@ -126,6 +127,18 @@ def test_a_long_tick_costs_its_own_slots_and_no_burst_follows(clock: Any) -> Non
     result = runner.run(max_ticks=4)
     assert skill.began_s == pytest.approx([100.0, 100.1, 100.5, 100.6])
     assert result.budget_violations == 1
+
+
+def test_a_tick_that_began_late_misses_its_deadline_within_its_budget() -> None:
+    """The second one oversleeps by half a period, then takes longer than the other half."""
+
+    class Oversleeping(ManualClock):
+        def sleep_s(self, duration_s: float) -> None:
+            super().sleep_s(duration_s + 0.05)
+
+    runner, _ = scripted(Oversleeping(), [0.0, 0.06], rate_hz=10)
+    result = runner.run(max_ticks=2)
+    assert (result.metadata["deadline_misses"], result.budget_violations) == (1, 0)
 
 
 def test_warn_applies_a_late_action_and_counts_it(clock: Any) -> None:

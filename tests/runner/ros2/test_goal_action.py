@@ -111,10 +111,12 @@ class Commander:
                         return reply
                 await asyncio.sleep(0.01)
 
-    async def goal(self, prompt: str, *, rskill: str = RSKILL, params: str = "") -> UUID_ | None:
+    async def goal(
+        self, prompt: str, *, rskill: str = RSKILL, params: str = "", metadata: str = ""
+    ) -> UUID_ | None:
         """Send a goal; None: it was rejected."""
         goal_id = UUID_(uuid.uuid4().bytes)
-        goal = Goal_(rskill, "", prompt, "", params, 0.0)
+        goal = Goal_(rskill, "", prompt, metadata, params, 0.0)
         told = await self.call(self.send, SendRequest_, goal_id, goal)
         return goal_id if told.accepted else None
 
@@ -191,6 +193,19 @@ async def test_goals_are_served_with_feedback_status_and_result(served_action: S
         assert await commander.goal("end", params="{") is None
         assert (await commander.ended(UUID_(uuid.uuid4().bytes))).status == 0
         assert bench.made[0].story.count("finish") == 2
+
+
+async def test_a_goal_joins_the_callers_trace(served_action: Serving) -> None:
+    """What is no traceparent is no reason to refuse a goal: it begins a trace of its own."""
+    trace = "0af7651916cd43dd8448eb211c80319c"
+    sent = f'{{"traceparent": "00-{trace}-b7ad6b7169203331-01"}}'
+    async with served_action() as (bench, commander):
+        for metadata, joins in ((sent, True), ('{"traceparent": "00-x"}', False), ("[", False)):
+            goal_id = await commander.goal("end", metadata=metadata)
+            assert goal_id is not None
+            told = (await commander.ended(goal_id)).result.trace_id
+            assert (told == trace, len(told)) == (joins, 32)
+            assert bench.made[0].traceparents[-1].split("-")[1] == told
 
 
 async def test_a_goal_is_canceled_alone_with_all_others_and_when_the_server_ends(

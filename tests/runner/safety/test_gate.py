@@ -98,6 +98,25 @@ def test_what_is_inside_passes_unchanged(names: tuple[str, ...] | None) -> None:
     assert gate().check(action, at(*HERE)) == (action, ())
 
 
+@pytest.mark.parametrize(
+    ("checked", "action", "world", "check"),
+    [
+        (gate(), to_row(0.0, 0.1, joint_names=("turn", "turn")), at(*HERE), "form"),
+        (gate(), to_row(*HERE), at(*HERE, age_ms=500.0), "freshness"),
+        (gate(), to_row(0.0, 2.5, 0.5), at(0.0, 1.95, 0.5), "joint_range"),
+        (gate(), to_row(0.0, 2.05, 0.5), at(0.0, 1.95, 0.5), "joint_range"),
+        (gate(), to_row(2.0, 1.0, 0.5), at(*HERE), "joint_speed"),
+        (gate(), to_row(*HERE), at(*HERE, velocity=(9.0, 0.0, 0.0)), "measured_speed"),
+        (gate(max_cartesian_step_m=0.02), to_row(0.03, 1.0, 0.5), at(*HERE), "tool_speed"),
+    ],
+)
+def test_a_violation_names_its_check(
+    checked: RobotGate, action: Action, world: WorldState, check: str
+) -> None:
+    _, problems = checked.check(action, world)
+    assert [problem.check for problem in problems] == [check]
+
+
 def test_ranges_are_still_checked() -> None:
     assert row_of(gate().check(to_row(1.95 + 0.1, joint_names=("reach",)), at(0.0, 1.95, 0.5))) == (
         2.0,

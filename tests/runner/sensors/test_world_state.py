@@ -120,6 +120,15 @@ def test_a_stamp_of_another_clock_is_refused(aggregator: WorldStateAggregator) -
     assert "future" in aggregator.why(JOINT_STATE)
 
 
+def test_a_failed_source_is_told_from_a_late_one(aggregator: WorldStateAggregator) -> None:
+    aggregator.update_joint_state(joint_state(START_NS), START_NS)
+    aggregator.update_image_frame(frame_at(START_NS), START_NS)
+    aggregator.lose("wrist", "its stream ended", failed=True)
+    late = aggregator.snapshot(START_NS + 101 * MS)
+    assert late.diagnostics == {"front": "stale", "wrist": "error", JOINT_STATE: "stale"}
+    assert late.stale == ("front", JOINT_STATE, "wrist")
+
+
 def test_a_camera_of_unknown_age_is_refused(aggregator: WorldStateAggregator) -> None:
     with pytest.raises(KeyError):
         aggregator.update_image_frame(frame_at(START_NS, "rear"), START_NS)

@@ -238,6 +238,20 @@ def test_spans_and_metrics_reach_the_collector_at_the_programs_end() -> None:
         )
 
 
+@needs_sdk
+@pytest.mark.parametrize(("given", "interval_ms"), [("", 5000.0), ("20000", 20000.0)])
+def test_metrics_leave_every_five_seconds_unless_the_environment_says_another(
+    given: str, interval_ms: float, variables: Variables
+) -> None:
+    variables({"OTEL_METRIC_EXPORT_INTERVAL": given, "OTEL_METRICS_EXPORTER": "console"})
+    ends: list[Callable[[], object]] = []
+    made = setup._meters(("console",), (), setup._resource("robot", {}), ends)
+    (reader,) = made._metric_readers
+    assert reader._export_interval_millis == interval_ms
+    for end in ends:
+        end()
+
+
 def free_port() -> str:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
