@@ -21,6 +21,11 @@ from vram_arbiter.runner.ros2.goal_action import INTERFACE, RunnerGoals
 pytestmark = [pytest.mark.anyio, pytest.mark.heavy]
 pytest.importorskip("cyclonedds")
 
+from cyclonedds.builtin import (  # noqa: E402
+    BuiltinDataReader,
+    BuiltinTopicDcpsPublication,
+    BuiltinTopicDcpsSubscription,
+)
 from cyclonedds.core import Policy, Qos  # noqa: E402
 from cyclonedds.domain import DomainParticipant  # noqa: E402
 from cyclonedds.idl.types import (  # noqa: E402
@@ -84,6 +89,7 @@ class Commander:
 
     def __init__(self, name: str) -> None:
         participant, path = DomainParticipant(DOMAIN), f"{name}/_action/"
+        self.participant, self.path = participant, path
         self.send = client_of(participant, path + "send_goal", SendRequest_, SendResponse_)
         self.result = client_of(participant, path + "get_result", ResultRequest_, ResultResponse_)
         self.cancel = client_of(participant, path + "cancel_goal", CancelRequest_, CancelResponse_)
@@ -132,6 +138,20 @@ class Commander:
                     if message.goal_id == goal_id:
                         return message.feedback
                 await asyncio.sleep(0.01)
+
+    async def type_hashes(self, count: int) -> dict[str, bytes]:
+        """Return what the server's endpoints tell of their types, by topic, once there are so
+        many: as `ros2 topic info -v` finds it."""
+        told: dict[str, bytes] = {}
+        async with asyncio.timeout(PATIENCE_S):
+            while len(told) < count:
+                for topic in (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription):
+                    for sample in BuiltinDataReader(self.participant, topic).take(N=100):
+                        name, quality = sample.topic_name, sample.qos
+                        if self.path in (name or "") and Policy.Userdata in quality:
+                            told[name] = quality[Policy.Userdata].data
+                await asyncio.sleep(0.01)
+        return told
 
     async def status(self, goal_id: UUID_, expected: int) -> None:
         """Wait until the status topic says so."""
@@ -238,3 +258,18 @@ async def test_goals_that_ended_are_forgotten_in_the_end(
             assert goal_id is not None
             assert (await commander.ended(goal_id)).status == 4
         assert (await commander.ended(first)).status == 0
+
+
+async def test_every_endpoint_tells_the_hash_of_its_type(served_action: Serving) -> None:
+    """REP 2011; of a service its request's and its reply's, as rmw_cyclonedds tells them."""
+    async with served_action() as (_, commander):
+        told = await commander.type_hashes(8)
+    short = {topic.rpartition("/")[2]: text for topic, text in told.items()}
+    assert sorted(short) == [
+        "cancel_goalReply", "cancel_goalRequest", "feedback", "get_resultReply",
+        "get_resultRequest", "send_goalReply", "send_goalRequest", "status",
+    ]  # fmt: skip
+    request = "3d3c84653c1f96918086887e1dcb236faec88b81a5b14fd4cf4840065bcdf8af"
+    assert short["cancel_goalRequest"] == f"typehash=RIHS01_{request};".encode()
+    status = "6c1684b00f177d37438febe6e709fc4e2b0d4248dca4854946f9ed8b30cda83e"
+    assert short["status"] == f"typehash=RIHS01_{status};".encode()
