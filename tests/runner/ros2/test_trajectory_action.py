@@ -2,6 +2,8 @@
 alone, sends what MoveIt sends, and reads feedback and the action's own error codes.
 """
 
+import argparse
+import asyncio
 import uuid
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
@@ -12,6 +14,7 @@ import pytest
 from tests.runner.goal_bench import goals_served
 from tests.support.dds import NETWORK
 from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.runner.cli import ros2
 from vram_arbiter.runner.goals.catalogue import Catalogue
 from vram_arbiter.runner.ros2.action_server import ActionServer
 from vram_arbiter.runner.ros2.trajectory_action import Code, TrajectoryGoals, action_name
@@ -27,6 +30,7 @@ pytest.importorskip("cyclonedds")
 from cyclonedds.idl.types import float64, int32, sequence, uint16, uint32  # noqa: E402
 
 from tests.runner.ros2.independent import Commander, Time_, struct  # noqa: E402
+from tests.runner.ros2.test_state_topics import JointState_, Listener  # noqa: E402
 from tests.runner.sensors.ros2_node import Header_  # noqa: E402
 
 DOMAIN = 82
@@ -111,8 +115,8 @@ NO_TIME = Duration_(0, 0)
 
 
 class Planner(Commander):
-    def __init__(self, name: str) -> None:
-        super().__init__(DOMAIN, name, PREFIX, Goal_, Result_, Feedback_)
+    def __init__(self, name: str, domain: int = DOMAIN) -> None:
+        super().__init__(domain, name, PREFIX, Goal_, Result_, Feedback_)
 
     async def follow(
         self,
@@ -160,26 +164,36 @@ Served = Callable[[], AbstractAsyncContextManager[Planner]]
 
 
 @pytest.fixture
-def served(
+def runner(
     make_runner: Any,
     kinematic: Any,
     endpoint: str,
     navigate_manifest: Any,
     monkeypatch: pytest.MonkeyPatch,
-) -> Served:
+) -> Callable[[], AbstractAsyncContextManager[Any]]:
+    """A runner that plays trajectories."""
     monkeypatch.setenv("CYCLONEDDS_URI", NETWORK)
-    name = f"/n{uuid.uuid4().hex}/follow_joint_trajectory"
     skills = [load_manifest(navigate_manifest.parents[1] / "so101-move/rskill.yaml")]
     limits = own_limits(kinematic)
 
-    @asynccontextmanager
-    async def serving() -> Any:
+    def serve() -> AbstractAsyncContextManager[Any]:
         catalogue = Catalogue(
             skills,
             {Kind.ROS_ACTION: lambda m: FollowJointTrajectory(m, limits, period_s=1 / RATE_HZ)},
         )
+        return goals_served(endpoint, make_runner(rate_hz=RATE_HZ), catalogue)
+
+    return serve
+
+
+@pytest.fixture
+def served(runner: Any, endpoint: str) -> Served:
+    name = f"/n{uuid.uuid4().hex}/follow_joint_trajectory"
+
+    @asynccontextmanager
+    async def serving() -> Any:
         async with (
-            goals_served(endpoint, make_runner(rate_hz=RATE_HZ), catalogue),
+            runner(),
             RunnerClient(endpoint) as client,
             ActionServer(TRAJECTORY, name, DOMAIN, TrajectoryGoals(client, RSKILL).accept),
         ):
@@ -248,3 +262,23 @@ async def test_an_arm_that_leaves_its_path_or_does_not_arrive_has_a_code_each(
         status, code, text = await planner.outcome(await planner.follow((0.3, (0.2, 1.35))))
         assert (status, code) == (ABORTED, Code.GOAL_TOLERANCE_VIOLATED)
         assert "from the last point" in text
+
+
+async def test_the_program_serves_trajectories_beside_goals_and_state(
+    runner: Any, endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Names are fixed, so the test has a domain of its own."""
+    domain = 190 + uuid.uuid4().int % 40
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    parser = argparse.ArgumentParser()
+    ros2.add_parser(parser.add_subparsers())
+    args = parser.parse_args(["ros2", "--trajectories", RSKILL, "--endpoint", endpoint])
+    async with runner():
+        program = asyncio.create_task(ros2.run(args))
+        joints = Listener(domain, "/joint_states", JointState_)
+        assert "wrist_flex" in (await joints.heard(1))[0].name
+        planner = Planner("/joint_trajectory_controller/follow_joint_trajectory", domain)
+        outcome = await planner.outcome(await planner.follow((0.3, (0.1, 1.35))))
+        assert outcome == (SUCCEEDED, Code.SUCCESSFUL, "")
+        program.cancel()
+        await asyncio.gather(program, return_exceptions=True)
