@@ -11,14 +11,16 @@ import time
 from collections.abc import AsyncIterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Any, Final
 
+from vram_arbiter.clients.net.server import VALUES_MAX
 from vram_arbiter.clients.runner import Goal, RunnerClient
 from vram_arbiter.runner.goals.catalogue import START_S
 from vram_arbiter.runner.ros2.action_server import Execution, Status
 from vram_arbiter.runner.ros2.goal_action import ENDINGS
 from vram_arbiter.runner.sensors.ros2_messages import stamp_of
 from vram_arbiter.runner.sensors.ros2_types import RosMessage
+from vram_arbiter.runner.sensors.world_state import JOINT_STATE
 from vram_arbiter.runner.skills.ros_goals import checked
 from vram_arbiter.runner.skills.ros_standins import TRAJECTORY, interface_of
 from vram_arbiter.runner.skills.trajectory import TrajectoryParams, position_at
@@ -32,6 +34,7 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import JsonObject
+from vram_arbiter.schemas.runtime.msgpack_codec import count_values, pack
 
 
 class Code(IntEnum):
@@ -50,6 +53,11 @@ CODES: Final[Mapping[str, Code]] = {
     GoalRejected.code: Code.GOAL_TOLERANCE_VIOLATED,
 }
 """By the code of a runner's result; the action has none for what else ends a motion."""
+# of each point, empty: a goal's message has a limit
+NOT_SENT: Final[Any] = {
+    "trajectory": {"points": {"__all__": {"velocities", "accelerations", "effort"}}, "header": True}
+}
+GOAL_VALUES_MAX: Final = VALUES_MAX - 64  # of the parameters: the message has others beside them
 UNSUPPORTED: Final = ("component_path_tolerance", "component_goal_tolerance")
 
 
@@ -86,7 +94,7 @@ class TrajectoryGoals:
             asked = params_of(goal)
             sent = await self._client.send_goal(
                 self._rskill_id,
-                goal_params=asked.model_dump(),
+                goal_params=_sendable(asked),
                 deadline_s=START_S + asked.last_s + asked.arrive_s,
                 goal_id=goal_id,
             )
@@ -114,11 +122,21 @@ def params_of(goal: RosMessage) -> TrajectoryParams:
     return checked(TrajectoryParams, {"trajectory": named} | {one: goal[one] for one in tolerances})
 
 
+def _sendable(asked: TrajectoryParams) -> JsonObject:
+    """Return what the runner is sent. Raises BadRequest: it is too long for one message, to which
+    the runner could not reply."""
+    params = asked.model_dump(exclude=NOT_SENT)
+    if count_values(pack(params), GOAL_VALUES_MAX) > GOAL_VALUES_MAX:
+        count = len(asked.trajectory.points)
+        raise BadRequest(f"{count} points are too many for one goal", hint="send several goals")
+    return params
+
+
 async def _positions(client: RunnerClient) -> dict[str, float]:
     """Return the joints' positions. Raises StateStale, and what the client raises."""
     world = (await client.state())["world"]
-    if world is None:
-        raise StateStale("the robot has not said where its joints are")
+    if world is None or world["diagnostics"].get(JOINT_STATE, "ok") != "ok":
+        raise StateStale("the robot does not say where its joints are")
     joints = world["joint_state"]
     return dict(zip(joints["name"], joints["position"], strict=True))
 
@@ -157,7 +175,10 @@ class _Trajectory:
                 continue
             elapsed_s = push["progress"] * self.asked.last_s
             desired = position_at(points, self.start, elapsed_s)
-            positions = await _positions(self.client)
+            try:
+                positions = await _positions(self.client)
+            except StateStale:
+                continue
             actual = tuple(positions[name] for name in names)
             yield {
                 "header": {"stamp": stamp_of(time.time_ns())},
