@@ -23,7 +23,7 @@ from vram_arbiter.schemas.runtime.version import add_version
 
 COMMANDS = (
     "sim", "benchmark", "deploy", "estop", "goal", "state", "frame", "reset", "mark", "episodes",
-    "replay", "ros2",
+    "replay", "ros2", "rosbag",
 )  # fmt: skip
 URGENT = "estop"
 CLIENTS = (URGENT, "goal", "state", "frame", "reset", "mark")  # they use no GPU

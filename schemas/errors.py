@@ -236,6 +236,10 @@ class GoalRejected(CallerError, code="goal_rejected"):
     """The goal does not fit the robot, the skill or the moment, or was not reached."""
 
 
+class PathToleranceViolated(CallerError, code="path_tolerance_violated"):
+    """A joint left its trajectory by more than the goal allows."""
+
+
 class EstopRequested(OperatorError, code="estop_requested"):
     """The emergency stop is latched: look at the robot, then start the runner again."""
 

@@ -137,12 +137,14 @@ class CameraModel(_Frozen):
     right, y down, z forward) in the robot's base frame, `support_plane_z` the height of the table
     or floor in that frame, in metres. `base_pose` is where the base stood by its own odometry when
     the picture was taken: x, y (metres) and yaw (rad); None: it cannot drive, or does not know.
+    `fixed`: the camera never moves in the base frame.
     """
 
     K: Matrix3
     T_base_camera: Matrix4
     support_plane_z: Finite = 0.0
     base_pose: Vector3 | None = None
+    fixed: bool = False
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -271,7 +271,7 @@ class _Script:
         """
         outcome = Outcome("error", "never looked")
         watched = self.search.camera_of(self.thing)
-        for camera in [watched] * bool(watched) + [""] * LOOKS_MAX:
+        for camera in ([watched] if watched else []) + [""] * LOOKS_MAX:
             outcome = yield LocateInView(
                 query=self.thing, camera=camera, rationale=f"where is the {self.thing}?"
             )

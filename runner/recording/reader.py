@@ -1,4 +1,4 @@
-"""One frame of a recorded dataset, with its trace and span. Needs neither lerobot nor torch.
+"""Frames of a recorded dataset, with their traces and spans. Needs neither lerobot nor torch.
 
 Reads finished episodes only, also while a runner records into the folder. Datasets of other
 programs, and those with lerobot's columns only, are refused: their rows lead to no trace.
@@ -21,6 +21,7 @@ from vram_arbiter.runner.recording.columns import (
     STATE,
     SUCCESS,
     Features,
+    camera_column,
 )
 from vram_arbiter.schemas.errors import BadRequest, ConfigError
 
@@ -36,7 +37,7 @@ class Recorded:
     """One frame.
 
     `state` and `action` are by joint (rad); `timings_ms` by part of the tick; `pictures` maps a
-    camera to its video's path and the second in it. The end of `goal` is that of its episode.
+    camera to its video's path, the second in it and the picture's age (ms). The end of `goal` is that of its episode.
     """
 
     root: str
@@ -65,25 +66,44 @@ def read_frame(root: Path, frame: int, episode: int | None = None) -> Recorded:
     Raises ConfigError for a folder that cannot be read or is not one of ours, BadRequest for a
     frame or an episode that does not exist.
     """
+    info = _info(root)
+    about = _episode(_rows(root, "meta/episodes"), frame, episode)
+    index = about["dataset_from_index"] + frame if episode is not None else frame
+    return _frames(root, info, about, ("index", "==", index), 1)[0]
+
+
+def read_episode(root: Path, episode: int) -> list[Recorded]:
+    """Read all frames of an episode, in their order. Raises as `read_frame`."""
+    info = _info(root)
+    about = _episode(_rows(root, "meta/episodes"), 0, episode)
+    where = ("episode_index", "==", episode)
+    return sorted(_frames(root, info, about, where, about["length"]), key=lambda one: one.frame)
+
+
+def _frames(
+    root: Path, info: dict[str, Any], about: ParquetRow, where: tuple[str, str, int], count: int
+) -> list[Recorded]:
+    rows = _rows(root, "data", where)
+    if len(rows) != count:
+        raise ConfigError(
+            f"{root} has {len(rows)} frames of {count} with {where[0]} {where[2]}",
+            hint="restore its files",
+        )
+    if "trace_id" not in rows[0]:
+        raise ConfigError(
+            f"{root} has the columns of lerobot only, and no ticks", hint="record it in full"
+        )
+    noted: dict[int, Mapping[str, Any]] = {note["episode"]: note for note in commit.notes(root)}
+    note = noted.get(about["episode_index"], {})
+    return [_recorded(root, info, about, row, note) for row in rows]
+
+
+def _info(root: Path) -> dict[str, Any]:
     if not commit.is_ours(root):
         raise ConfigError(
             f"{root} is not a dataset that this program recorded",
             hint="name the folder that --record or save_dir named",
         )
-    info = _info(root)
-    about = _episode(_rows(root, "meta/episodes"), frame, episode)
-    index = about["dataset_from_index"] + frame if episode is not None else frame
-    rows = _rows(root, "data", ("index", "==", index))
-    if len(rows) != 1:
-        raise ConfigError(f"{root} does not have frame {index}", hint="restore its files")
-    if "trace_id" not in rows[0]:
-        raise ConfigError(
-            f"{root} has the columns of lerobot only, and no ticks", hint="record it in full"
-        )
-    return _recorded(root, info, about, rows[0])
-
-
-def _info(root: Path) -> dict[str, Any]:
     path = root / "meta" / "info.json"
     try:
         info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -131,10 +151,14 @@ def _episode(episodes: list[ParquetRow], frame: int, wanted: int | None) -> Parq
     raise BadRequest(f"unknown frame {frame}", hint=hint)
 
 
-def _recorded(root: Path, info: dict[str, Any], about: ParquetRow, row: ParquetRow) -> Recorded:
+def _recorded(
+    root: Path,
+    info: dict[str, Any],
+    about: ParquetRow,
+    row: ParquetRow,
+    note: Mapping[str, Any],
+) -> Recorded:
     features: Features = info["features"]
-    notes = {note["episode"]: note for note in commit.notes(root)}
-    note: Mapping[str, Any] = notes.get(about["episode_index"], {})
 
     def named(column: str) -> dict[str, float]:
         values = row.get(column, [])  # of a single number lerobot makes a plain one
@@ -142,6 +166,7 @@ def _recorded(root: Path, info: dict[str, Any], about: ParquetRow, row: ParquetR
         names = features[column]["names"] if column in features else None
         return dict(zip(names or [], listed, strict=True))
 
+    ages_ms = {camera_column(name): age for name, age in named("tick.camera_ages_ms").items()}
     pictures = {}
     for column, feature in features.items():
         if feature["dtype"] == "video":
@@ -151,7 +176,8 @@ def _recorded(root: Path, info: dict[str, Any], about: ParquetRow, row: ParquetR
                 file_index=about[f"videos/{column}/file_index"],
             )
             at_s = about[f"videos/{column}/from_timestamp"] + row["timestamp"]
-            pictures[column.removeprefix(PICTURES)] = {"path": str(root / video), "at_s": at_s}
+            name, path = column.removeprefix(PICTURES), str(root / video)
+            pictures[name] = {"path": path, "at_s": at_s, "age_ms": ages_ms[column]}
     tick = {name: row[f"tick.{name}"] for name in OF_TICK}
     if tick["chunk_index"] == NO_CHUNK:
         tick["chunk_index"] = None

@@ -13,15 +13,9 @@ import logging
 import secrets
 from typing import Any, Self
 
-from vram_arbiter.runner.ros2 import messages
 from vram_arbiter.runner.sensors.dds_thread import DdsThread
-from vram_arbiter.runner.sensors.ros2_dds import (
-    cdr_of,
-    dds_problems,
-    full_topic,
-    qos_of,
-    sample_of,
-)
+from vram_arbiter.runner.sensors.ros2_dds import dds_problems, full_topic, reader_of, writer_of
+from vram_arbiter.runner.sensors.ros2_types import action_of, cdr_of, read, sample_of, write
 from vram_arbiter.schemas.errors import ConfigError, SidecarUnavailable
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
 
@@ -29,7 +23,7 @@ log = logging.getLogger(__name__)
 
 REPLIES_KEPT = 16
 SERVICES = ("send_goal", "get_result", "cancel_goal")
-CANCEL = "action_msgs/CancelGoal"
+CANCEL = "action_msgs/srv/CancelGoal"
 
 
 class ActionClient:
@@ -43,7 +37,8 @@ class ActionClient:
             self.name = full_topic(name)
         except ValueError as error:
             raise ConfigError(f"the action's name: {error}") from error
-        kinds = (f"{interface}_SendGoal", f"{interface}_GetResult", CANCEL)
+        action = action_of(interface)
+        kinds = (f"{action}_SendGoal", f"{action}_GetResult", CANCEL)
         self._kinds = dict(zip(SERVICES, kinds, strict=True))
         self._domain = domain
         self._guid = secrets.randbits(63)
@@ -81,10 +76,10 @@ class ActionClient:
         self._sent += 1
         number = self._sent
         kind = self._kinds[service] + "_Request"
-        cdr = messages.write(kind, {"guid": self._guid, "seq": number, **fields})
+        cdr = write(kind, {"guid": self._guid, "seq": number, **fields})
         reply = self._waiting[service, number] = self._loop.create_future()
         try:
-            self._writers[service].write(sample_of(messages.dds_type(kind), cdr))
+            self._writers[service].write(sample_of(kind, cdr))
             answer: JsonObject = await reply
             return answer
         finally:
@@ -94,18 +89,16 @@ class ActionClient:
     def _open(self) -> DdsThread:
         from cyclonedds.core import DDSStatus
         from cyclonedds.domain import DomainParticipant
-        from cyclonedds.pub import DataWriter
-        from cyclonedds.sub import DataReader
-        from cyclonedds.topic import Topic
 
-        quality = qos_of("reliable", writer=True, kept=REPLIES_KEPT, wait_s=1)
         participant = DomainParticipant(self._domain)
         for service, kind in self._kinds.items():
             path = f"{self.name}/_action/{service}"
-            asked = Topic(participant, f"rq{path}Request", messages.dds_type(kind + "_Request"))
-            told = Topic(participant, f"rr{path}Reply", messages.dds_type(kind + "_Response"))
-            writer = self._writers[service] = DataWriter(participant, asked, qos=quality)
-            reader = self._readers[service] = DataReader(participant, told, qos=quality)
+            writer = self._writers[service] = writer_of(
+                participant, f"rq{path}Request", f"{kind}_Request", kept=REPLIES_KEPT, wait_s=1
+            )
+            reader = self._readers[service] = reader_of(
+                participant, f"rr{path}Reply", f"{kind}_Response", kept=REPLIES_KEPT
+            )
             writer.set_status_mask(DDSStatus.PublicationMatched)
             reader.set_status_mask(DDSStatus.SubscriptionMatched)
         readers, writers = self._readers.values(), self._writers.values()
@@ -134,7 +127,7 @@ class ActionClient:
 
     def _took(self, service: str, cdr: bytes) -> None:
         try:
-            reply = messages.read(self._kinds[service] + "_Response", cdr)
+            reply = read(self._kinds[service] + "_Response", cdr)
         except ValueError as error:
             log.warning("a reply of %s/%s cannot be read: %s", self.name, service, error)
             return

@@ -14,17 +14,16 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final, Protocol, Self
 
-from vram_arbiter.runner.ros2 import messages
 from vram_arbiter.runner.ros2.action_client import CANCEL, SERVICES
 from vram_arbiter.runner.sensors.dds_thread import DdsThread
 from vram_arbiter.runner.sensors.ros2_dds import (
-    cdr_of,
     dds_problems,
     dds_topic,
     full_topic,
-    qos_of,
-    sample_of,
+    reader_of,
+    writer_of,
 )
+from vram_arbiter.runner.sensors.ros2_types import action_of, cdr_of, read, sample_of, write
 from vram_arbiter.schemas.errors import ConfigError, VramError
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
 
@@ -34,7 +33,7 @@ REQUESTS_KEPT: Final = 16  # in DDS, until the thread has come to them
 REQUESTS_MAX: Final = 256  # that are being answered; results of goals that run among them
 GOALS_KEPT: Final = 64  # that ended: their results may still be asked for
 LAST_S: Final = 1.0  # at the end, for replies to leave and to be received
-STATUS = "action_msgs/GoalStatusArray"
+STATUS = "action_msgs/msg/GoalStatusArray"
 
 
 class Status(IntEnum):
@@ -97,9 +96,10 @@ class ActionServer:
             self.name = full_topic(name)
         except ValueError as error:
             raise ConfigError(f"the action's name: {error}") from error
-        kinds = (f"{interface}_SendGoal", f"{interface}_GetResult", CANCEL)
+        action = action_of(interface)
+        kinds = (f"{action}_SendGoal", f"{action}_GetResult", CANCEL)
         self._kinds = dict(zip(SERVICES, kinds, strict=True))
-        self._feedback_kind = f"{interface}_FeedbackMessage"
+        self._feedback_kind = f"{action}_FeedbackMessage"
         self._domain = domain
         self._accept = accept
         self._goals: dict[str, _Goal] = {}
@@ -136,28 +136,22 @@ class ActionServer:
     # -- DDS
     def _open(self) -> DdsThread:
         from cyclonedds.domain import DomainParticipant
-        from cyclonedds.pub import DataWriter
-        from cyclonedds.sub import DataReader
-        from cyclonedds.topic import Topic
 
         participant = DomainParticipant(self._domain)
-        quality = qos_of("reliable", writer=True, kept=REQUESTS_KEPT, wait_s=1)
         for service, kind in self._kinds.items():
             path = f"{self.name}/_action/{service}"
-            asked = Topic(participant, f"rq{path}Request", messages.dds_type(kind + "_Request"))
-            told = Topic(participant, f"rr{path}Reply", messages.dds_type(kind + "_Response"))
-            self._writers[service] = DataWriter(participant, told, qos=quality)
-            self._readers[service] = DataReader(participant, asked, qos=quality)
-        for topic, kind, latched in (
-            ("feedback", self._feedback_kind, False),
-            ("status", STATUS, True),
-        ):
-            name = dds_topic(f"{self.name}/_action/{topic}")
-            quality = qos_of(
-                "reliable", writer=True, kept=1 if latched else REQUESTS_KEPT, latched=latched
+            self._writers[service] = writer_of(
+                participant, f"rr{path}Reply", f"{kind}_Response", kept=REQUESTS_KEPT, wait_s=1
             )
-            described = Topic(participant, name, messages.dds_type(kind))
-            self._writers[topic] = DataWriter(participant, described, qos=quality)
+            self._readers[service] = reader_of(
+                participant, f"rq{path}Request", f"{kind}_Request", kept=REQUESTS_KEPT
+            )
+        told = dds_topic(f"{self.name}/_action/feedback")
+        self._writers["feedback"] = writer_of(
+            participant, told, self._feedback_kind, kept=REQUESTS_KEPT
+        )
+        told = dds_topic(f"{self.name}/_action/status")
+        self._writers["status"] = writer_of(participant, told, STATUS, latched=True)
         return DdsThread(
             "ros2-action-server",
             participant,
@@ -174,7 +168,7 @@ class ActionServer:
                 if not sample.sample_info.valid_data:
                     continue
                 try:
-                    request = messages.read(self._kinds[service] + "_Request", cdr_of(sample))
+                    request = read(self._kinds[service] + "_Request", cdr_of(sample))
                 except ValueError as error:
                     log.warning("a request of %s/%s cannot be read: %s", self.name, service, error)
                     continue
@@ -184,8 +178,8 @@ class ActionServer:
         self._loop.call_soon_threadsafe(self._fail, problem)
 
     def _write(self, topic: str, kind: str, message: JsonMap) -> None:
-        cdr = messages.write(kind, message)
-        self._writers[topic].write(sample_of(messages.dds_type(kind), cdr))
+        cdr = write(kind, message)
+        self._writers[topic].write(sample_of(kind, cdr))
 
     def _fail(self, problem: str) -> None:
         if not self.failed.done():

@@ -1,21 +1,20 @@
-"""ROS 2's side of DDS: topic and type names, domain, quality of service. Needs no ROS installation.
+"""ROS 2's side of DDS: topic names, domain, readers and writers with their quality of service. Needs
+no ROS installation.
 
 Cyclone DDS chooses the network: `CYCLONEDDS_URI` configures it, as for ROS with rmw_cyclonedds.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from vram_arbiter.runner.sensors.ros2_types import dds_type, type_hash
 from vram_arbiter.schemas.errors import ConfigError
 
-PLAIN_CDR = (0, 1, 6, 7)  # CDR and CDR 2, both byte orders
 DOMAIN_MAX = 232  # the last one whose ports exist
 DOMAIN_VARIABLE = "ROS_DOMAIN_ID"
 _NAME = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*")
@@ -48,67 +47,57 @@ def domain_of(environment: Mapping[str, str] = os.environ) -> int:
     return int(text)
 
 
-def as_bytes(made: Any) -> Any:
-    """Let the samples of a DDS type stay as bytes (`cdr_of`, `sample_of`), and return the type."""
-    made.deserialize = staticmethod(lambda data, *_, **__: sample_of(made, bytes(data)))
-    made.serialize = lambda self, *_, **__: cdr_of(self)
-    return made
-
-
-@functools.cache
-def topic_type(message: Any) -> Any:
-    """Return the type of a topic of these IDL messages; its samples stay as bytes.
-
-    Cyclone's description of a type knows `bytes` as a sequence only.
-    """
-    from cyclonedds.idl import make_idl_struct
-    from cyclonedds.idl.types import sequence, uint8
-
-    members = {
-        one.name: sequence[uint8] if one.type is bytes else one.type
-        for one in dataclasses.fields(message)
-    }
-    return as_bytes(make_idl_struct(message.__name__, message.__idl_typename__, members))
-
-
-def parse[M](message: type[M], cdr: bytes) -> M:
-    """Read plain CDR as one of Cyclone's IDL types. Raises ValueError."""
-    if len(cdr) < 4 or cdr[0] != 0 or cdr[1] not in PLAIN_CDR:
-        raise ValueError("the message is in an encoding other than plain CDR")
-    try:
-        read: M = message.__idl__.deserialize(cdr)  # type: ignore[attr-defined]
-    except Exception as error:  # whatever Cyclone's parser hits
-        raise ValueError(f"the message cannot be read: {error}") from error
-    return read
-
-
-def written(message: Any) -> bytes:
-    """Return one of Cyclone's IDL messages as plain CDR, as ROS writes it."""
-    cdr: bytes = message.serialize(use_version_2=False)
-    return cdr
-
-
-def sample_of(dds_type: Any, cdr: bytes) -> Any:
-    """Return a sample of that type with these bytes."""
-    sample = dds_type.__new__(dds_type)
-    sample.cdr = cdr
-    return sample
-
-
-def cdr_of(sample: Any) -> bytes:
-    """Return the bytes of a received sample, or of one made by `sample_of`."""
-    cdr: bytes = sample.cdr
-    return cdr
-
-
-def qos_of(
-    reliability: str, *, writer: bool, kept: int = 1, wait_s: int = 0, latched: bool = False
+def reader_of(
+    participant: Any, topic: str, kind: str, reliability: str = "reliable", kept: int = 1
 ) -> Any:
-    """Return ROS's quality of service: the newest `kept` samples, plain CDR.
+    """Return a reader of a DDS topic; it keeps the newest `kept` samples."""
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
 
-    A writer waits `wait_s` for a slow reader at most; then it drops. `latched`: readers that come
-    later get what was kept; otherwise nothing is.
+    described = Topic(participant, topic, dds_type(kind))
+    return DataReader(participant, described, qos=_qos(kind, reliability, kept))
+
+
+def writer_of(
+    participant: Any,
+    topic: str,
+    kind: str,
+    *,
+    kept: int = 1,
+    wait_s: int = 0,
+    latched: bool = False,
+) -> Any:
+    """Return a reliable writer on a DDS topic; it keeps the newest `kept` samples.
+
+    It waits `wait_s` for a slow reader at most; then it drops. `latched`: readers that come later
+    get what was kept; otherwise nothing is.
     """
+    from cyclonedds.core import Policy
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.topic import Topic
+
+    described = Topic(participant, topic, dds_type(kind))
+    quality = _qos(
+        kind,
+        "reliable",
+        kept,
+        Policy.WriterDataLifecycle(autodispose=False),  # ROS disposes of nothing
+        wait_s=wait_s,
+        latched=latched,
+    )
+    return DataWriter(participant, described, qos=quality)
+
+
+def _qos(
+    kind: str,
+    reliability: str,
+    kept: int,
+    *more: Any,
+    wait_s: int = 0,
+    latched: bool = False,
+) -> Any:
+    """Return ROS's quality of service: plain CDR, and the type's hash where rmw_cyclonedds has it
+    (`encode_type_hash_for_user_data_qos` of rmw_dds_common)."""
     from cyclonedds.core import Policy, Qos
     from cyclonedds.util import duration
 
@@ -118,9 +107,8 @@ def qos_of(
         Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
         Policy.History.KeepLast(kept),
         Policy.DataRepresentation(use_cdrv0_representation=True),
-        *(
-            (Policy.WriterDataLifecycle(autodispose=False),) if writer else ()
-        ),  # ROS disposes of nothing
+        Policy.Userdata(f"typehash={type_hash(kind)};".encode()),
+        *more,
     )
 
 

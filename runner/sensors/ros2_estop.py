@@ -6,7 +6,6 @@ breaks down. A publisher that is away stops nothing: the topic is a button, not 
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import logging
 from collections.abc import Callable, Iterator
@@ -14,14 +13,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from vram_arbiter.runner.sensors.dds_thread import DdsThread
-from vram_arbiter.runner.sensors.ros2_dds import (
-    as_bytes,
-    cdr_of,
-    dds_problems,
-    dds_topic,
-    domain_of,
-    qos_of,
-)
+from vram_arbiter.runner.sensors.ros2_dds import dds_problems, dds_topic, domain_of, reader_of
+from vram_arbiter.runner.sensors.ros2_types import cdr_of
 from vram_arbiter.schemas.config.robot import RobotEnvironment
 from vram_arbiter.schemas.errors import ConfigError
 
@@ -65,16 +58,12 @@ class _Listener:
     def __init__(self, topic: str, name: str, domain: int, stop: Callable[[str], None]) -> None:
         from cyclonedds.core import DDSStatus
         from cyclonedds.domain import DomainParticipant
-        from cyclonedds.sub import DataReader
-        from cyclonedds.topic import Topic
 
         self._topic, self._stop = topic, stop
         with dds_problems(domain):
             participant = DomainParticipant(domain)
             # not the newest alone: a button that is let go at once has been pressed
-            quality = qos_of("reliable", writer=False, kept=MESSAGES_KEPT)
-            named = Topic(participant, name, bool_type())
-            reader: Any = DataReader(participant, named, qos=quality)
+            reader = reader_of(participant, name, "std_msgs/msg/Bool", kept=MESSAGES_KEPT)
             reader.set_status_mask(DDSStatus.RequestedIncompatibleQos)
             self._thread = DdsThread(
                 "estop-topic",
@@ -111,11 +100,3 @@ def said(cdr: bytes) -> str:
     if len(cdr) < _BOOL_BYTES or cdr[0] != 0 or cdr[4] > 1:
         return "sent what cannot be read"
     return "says stop" if cdr[4] else ""
-
-
-@functools.cache
-def bool_type() -> Any:
-    """Return the DDS type of `std_msgs/Bool`; its samples stay as bytes."""
-    from cyclonedds.idl import make_idl_struct
-
-    return as_bytes(make_idl_struct("Bool_", "std_msgs.msg.dds_.Bool_", {"data": bool}))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -19,24 +19,25 @@ from vram_arbiter.runner.sensors.params import (
 from vram_arbiter.runner.sensors.pictures import scaled_down
 from vram_arbiter.runner.sensors.ros2_dds import (
     DOMAIN_MAX,
-    cdr_of,
     dds_problems,
     dds_topic,
     domain_of,
     full_topic,
-    parse,
-    qos_of,
-    sample_of,
-    topic_type,
-    written,
+    reader_of,
+    writer_of,
 )
+from vram_arbiter.runner.sensors.ros2_messages import (
+    COMPRESSED,
+    IMAGE,
+    message_of,
+    picture_of,
+    stamp_ns_of,
+)
+from vram_arbiter.runner.sensors.ros2_types import RosMessage, cdr_of, read, sample_of, write
 from vram_arbiter.runner.sensors.slot import Feed, FrameTee, SlotReader
 from vram_arbiter.schemas.config.robot import SensorReaderConfig
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.world import SensorFrame
-
-if TYPE_CHECKING:
-    from vram_arbiter.runner.sensors.ros2_messages import RosPicture
 
 log = logging.getLogger(__name__)
 
@@ -117,27 +118,19 @@ class RosImageReader(SlotReader):
         self._domain_id = domain_id
         self._topic = full_topic(params.topic)
         self._awaits = False  # the first publisher
-        self._message: Any = None  # the IDL type
+        self._kind = IMAGE if params.message == "image" else COMPRESSED
         self._thread: DdsThread | None = None
 
     def _run_begins(self, feed: Feed) -> None:
         """Start reading. Raises ConfigError if DDS cannot be started."""
         from cyclonedds.core import DDSStatus
         from cyclonedds.domain import DomainParticipant
-        from cyclonedds.sub import DataReader
-        from cyclonedds.topic import Topic
 
-        from vram_arbiter.runner.sensors.ros2_messages import RosCompressedImage, RosImage
-
-        self._message = RosImage if self._params.message == "image" else RosCompressedImage
         self._awaits = feed.await_source(f"{self._topic} has no publisher yet")
         with dds_problems(self._domain_id):
             participant = DomainParticipant(self._domain_id)
-            reader: Any = DataReader(
-                participant,
-                Topic(participant, dds_topic(self._topic), topic_type(self._message)),
-                qos=qos_of(self._params.reliability, writer=False),
-            )
+            topic = dds_topic(self._topic)
+            reader = reader_of(participant, topic, self._kind, self._params.reliability)
             reader.set_status_mask(
                 DDSStatus.SubscriptionMatched | DDSStatus.RequestedIncompatibleQos
             )
@@ -203,22 +196,18 @@ class RosImageReader(SlotReader):
         if newest is None:
             return
         try:
-            message = parse(self._message, cdr_of(newest))
+            message = read(self._kind, cdr_of(newest))
             frame = self._frame(message, newest.sample_info.source_timestamp)
         except ValueError as error:
             feed.interrupt(f"what comes on {self._topic} cannot be used: {error}")
         else:
             self.deliver(feed, frame)
 
-    def _frame(self, message: RosPicture, sent_ns: int) -> SensorFrame:
+    def _frame(self, message: RosMessage, sent_ns: int) -> SensorFrame:
         """Return a frame. Raises ValueError for a stamp of the future, or no picture."""
-        from vram_arbiter.runner.sensors.ros2_messages import picture_of
-
-        picture = picture_of(message)
+        picture = picture_of(self._kind, message)
         now_ns, wall_ns = self.clock.now_ns(), self.clock.wall_ns()
-        taken_ns = (
-            (message.header.stamp_ns or sent_ns) if self._params.stamp == "header" else wall_ns
-        )
+        taken_ns = (stamp_ns_of(message) or sent_ns) if self._params.stamp == "header" else wall_ns
         if taken_ns < 0:
             raise ValueError("it is stamped before 1970")
         age_ns = wall_ns - taken_ns
@@ -237,7 +226,7 @@ class RosImageReader(SlotReader):
             height=picture.height,
             channels=picture.channels,
             data=picture.data,
-            metadata={"frame_id": message.header.frame_id, "topic": self._topic},
+            metadata={"frame_id": message["header"]["frame_id"], "topic": self._topic},
         )
 
 
@@ -268,22 +257,19 @@ class RosImagePublisher:
         self._next_ns = 0.0
         self._width = width
         self._failing = False
-        self._kind: type | None = None  # of its messages
+        self._kind = ""  # of its messages
         self._writer: Any = None
 
     def publish(self, frame: SensorFrame) -> None:
         from cyclonedds.core import DDSException
-
-        from vram_arbiter.runner.sensors.ros2_messages import message_of
 
         if frame.stamp_monotonic_ns < self._next_ns:
             return
         try:
             if self._width is not None:
                 frame = scaled_down(frame, self._width)
-            message = message_of(frame)
-            kind: Any = type(message)
-            self._open(kind).write(sample_of(topic_type(kind), written(message)))
+            kind, message = message_of(frame)
+            self._open(kind).write(sample_of(kind, write(kind, message)))
         except (ValueError, ConfigError, DDSException) as error:
             self.dropped += 1
             if not self._failing:
@@ -301,18 +287,15 @@ class RosImagePublisher:
 
     def close(self) -> None:
         """Leave the domain. `publish` joins it again."""
-        self._writer = self._kind = None
+        self._writer, self._kind = None, ""
 
-    def _open(self, kind: type) -> Any:
+    def _open(self, kind: str) -> Any:
         from cyclonedds.domain import DomainParticipant
-        from cyclonedds.pub import DataWriter
-        from cyclonedds.topic import Topic
 
         if self._writer is None:
             with dds_problems(self.domain_id):
                 participant = DomainParticipant(self.domain_id)
-                topic = Topic(participant, dds_topic(self.topic), topic_type(kind))
-                self._writer = DataWriter(participant, topic, qos=qos_of("reliable", writer=True))
+                self._writer = writer_of(participant, dds_topic(self.topic), kind)
             self._kind = kind
         elif kind != self._kind:
             raise ValueError(

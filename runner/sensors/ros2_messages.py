@@ -1,20 +1,21 @@
 """Picture messages of ROS 2 (`sensor_msgs/Image`, `sensor_msgs/CompressedImage`) as frames.
 
-No clock and no network: Cyclone's IDL types describe the messages, and write and read their CDR.
-Nothing is guessed: a message whose parts contradict each other is a ValueError. Cyclone takes
-annotations as objects only, so this module has no future import of them.
+No clock and no network. Nothing is guessed: a message whose parts contradict each other is a
+ValueError.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Self
+from __future__ import annotations
 
-from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import int32, uint8, uint32
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
 
 from vram_arbiter.runner.sensors.image_header import jpeg_header
+from vram_arbiter.runner.sensors.ros2_types import RosMessage
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
+IMAGE: Final = "sensor_msgs/msg/Image"
+COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
 NANOSECONDS = 1_000_000_000
 STAMP_END_NS = 2**31 * NANOSECONDS
 SIDE_MAX = 16_384  # pixels
@@ -36,49 +37,17 @@ _ROS_NAME = {
 }
 
 
-@dataclass
-class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):  # type: ignore[call-arg, misc]
-    sec: int32 = 0
-    nanosec: uint32 = 0
+def stamp_of(stamp_ns: int) -> RosMessage:
+    """Return `builtin_interfaces/Time`. Raises ValueError: ROS has no stamp for it."""
+    if not 0 <= stamp_ns < STAMP_END_NS:
+        raise ValueError("ROS has no stamp for this time: its seconds end in 2038")
+    return {"sec": stamp_ns // NANOSECONDS, "nanosec": stamp_ns % NANOSECONDS}
 
 
-@dataclass
-class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):  # type: ignore[call-arg, misc]
-    stamp: Time = field(default_factory=Time)
-    frame_id: str = ""
-
-    @classmethod
-    def of(cls, stamp_ns: int, frame_id: str) -> Self:
-        return cls(Time(stamp_ns // NANOSECONDS, stamp_ns % NANOSECONDS), frame_id)
-
-    @property
-    def stamp_ns(self) -> int:
-        """Return when it was taken, from 1970 by the sender's clock; 0: not stamped."""
-        return int(self.stamp.sec * NANOSECONDS + self.stamp.nanosec)
-
-
-@dataclass
-class RosImage(IdlStruct, typename="sensor_msgs.msg.dds_.Image_"):  # type: ignore[call-arg, misc]
-    header: Header
-    height: uint32
-    width: uint32
-    encoding: str
-    is_bigendian: uint8
-    step: uint32
-    data: bytes
-
-
-_COMPRESSED = "sensor_msgs.msg.dds_.CompressedImage_"
-
-
-@dataclass
-class RosCompressedImage(IdlStruct, typename=_COMPRESSED):  # type: ignore[call-arg, misc]
-    header: Header
-    format: str
-    data: bytes
-
-
-RosPicture = RosImage | RosCompressedImage
+def stamp_ns_of(message: RosMessage) -> int:
+    """Return the header's time, from 1970 by the sender's clock; 0: not stamped."""
+    stamp = message["header"]["stamp"]
+    return int(stamp["sec"] * NANOSECONDS + stamp["nanosec"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,62 +61,61 @@ class ImageContent:
     data: bytes
 
 
-def picture_of(message: RosPicture) -> ImageContent:
+def picture_of(kind: str, message: RosMessage) -> ImageContent:
     """Return the picture in a message. Raises ValueError with the reason.
 
     Rows lose their padding, 16-bit values become little-endian.
     """
-    if isinstance(message, RosCompressedImage):
+    if kind == COMPRESSED:
         return _compressed(message)
-    known = _ENCODINGS.get(message.encoding)
+    known = _ENCODINGS.get(message["encoding"])
     if known is None:
         raise ValueError(
-            f"encoding {message.encoding!r} is not supported, only {', '.join(_ENCODINGS)}"
+            f"encoding {message['encoding']!r} is not supported, only {', '.join(_ENCODINGS)}"
         )
     encoding, per_pixel = known
-    if not (0 < message.width <= SIDE_MAX and 0 < message.height <= SIDE_MAX):
-        raise ValueError(f"a picture of {message.width} × {message.height} pixels")
-    row, step, rows = message.width * per_pixel, message.step, message.height
-    if step < row or len(message.data) != step * rows:
+    width, rows, step = message["width"], message["height"], message["step"]
+    if not (0 < width <= SIDE_MAX and 0 < rows <= SIDE_MAX):
+        raise ValueError(f"a picture of {width} × {rows} pixels")
+    row, data = width * per_pixel, message["data"]
+    if step < row or len(data) != step * rows:
         raise ValueError(
             f"{rows} rows of {step} bytes do not make a {encoding} picture"
-            f" of {message.width} × {rows} in {len(message.data)} bytes"
+            f" of {width} × {rows} in {len(data)} bytes"
         )
-    data = message.data
     if step > row:
         data = b"".join(data[at : at + row] for at in range(0, step * rows, step))
-    if per_pixel == 2 and message.is_bigendian:
+    if per_pixel == 2 and message["is_bigendian"]:
         swapped = bytearray(data)
         swapped[0::2], swapped[1::2] = data[1::2], data[0::2]
         data = bytes(swapped)
-    return ImageContent(encoding, message.width, rows, 3 if per_pixel == 3 else 1, data)
+    return ImageContent(encoding, width, rows, 3 if per_pixel == 3 else 1, data)
 
 
-def _compressed(message: RosCompressedImage) -> ImageContent:
+def _compressed(message: RosMessage) -> ImageContent:
     # image_transport writes "rgb8; jpeg compressed bgr8"; plain publishers write "jpeg" or "jpg"
-    if "jpeg" not in message.format.lower() and "jpg" not in message.format.lower():
-        raise ValueError(f"format {message.format!r} is not supported, only jpeg")
-    width, height, channels = jpeg_size(message.data)
-    return ImageContent(FrameEncoding.JPEG, width, height, channels, message.data)
+    form = message["format"].lower()
+    if "jpeg" not in form and "jpg" not in form:
+        raise ValueError(f"format {message['format']!r} is not supported, only jpeg")
+    width, height, channels = jpeg_size(message["data"])
+    return ImageContent(FrameEncoding.JPEG, width, height, channels, message["data"])
 
 
-def message_of(frame: SensorFrame) -> RosPicture:
-    """Return the ROS message for a frame.
+def message_of(frame: SensorFrame) -> tuple[str, RosMessage]:
+    """Return the ROS message for a frame, and its type.
 
     Raises ValueError for an encoding that ROS does not have.
     """
     if frame.data is None:
         raise ValueError("the frame's bytes are not in this process")
-    if not 0 <= frame.stamp_wall_ns < STAMP_END_NS:
-        raise ValueError("ROS has no stamp for this time: its seconds end in 2038")
-    header = Header.of(frame.stamp_wall_ns, frame.sensor_id)
+    header = {"stamp": stamp_of(frame.stamp_wall_ns), "frame_id": frame.sensor_id}
     if frame.encoding is FrameEncoding.JPEG:
-        return RosCompressedImage(header, "jpeg", frame.data)
+        return COMPRESSED, {"header": header, "format": "jpeg", "data": frame.data}
     name = _ROS_NAME.get(frame.encoding)
     if name is None:
         raise ValueError(f"{frame.encoding} has no name in ROS")
-    step = len(frame.data) // frame.height
-    return RosImage(header, frame.height, frame.width, name, 0, step, frame.data)
+    size = {"height": frame.height, "width": frame.width, "step": len(frame.data) // frame.height}
+    return IMAGE, {"header": header, "encoding": name, **size, "data": frame.data}
 
 
 def jpeg_size(data: bytes) -> tuple[int, int, int]:

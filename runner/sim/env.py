@@ -256,6 +256,7 @@ class SimEnv:
             T_base_camera=(rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0)),
             support_plane_z=self.config.table_top_z_m + CENTRE_HEIGHT_M,
             base_pose=self.base_pose(),
+            fixed=spec.parent == "base",
         )
 
     def seen_objects(self, camera: str) -> dict[str, SeenObject]:

@@ -38,8 +38,13 @@ def parse_goal[Message: BaseModel](
     defaults = (
         json.loads(manifest.ros_integration.default_goal_json) if manifest.ros_integration else {}
     )
+    return checked(message, merge(defaults, params))
+
+
+def checked[Message: BaseModel](message: type[Message], params: GoalParams) -> Message:
+    """Return a goal's parameters as a model. Raises BadRequest, field by field."""
     try:
-        return message.model_validate(merge(defaults, params))
+        return message.model_validate(params)
     except ValidationError as error:
         fields = [
             {"path": ".".join(map(str, item["loc"])) or "goal_params", "problem": item["msg"]}

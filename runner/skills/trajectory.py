@@ -8,7 +8,7 @@ too fast is refused before anything moves. Safety is the gate's, as for every sk
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Annotated
 
@@ -19,7 +19,7 @@ from vram_arbiter.runner.safety.limits import Limits
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.runner.skills.motion import REACHED_RAD, action_of, joint_positions
 from vram_arbiter.runner.skills.ros_goals import parse_goal
-from vram_arbiter.schemas.errors import BadRequest, GoalRejected
+from vram_arbiter.schemas.errors import BadRequest, GoalRejected, PathToleranceViolated
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.world import WorldState
 
@@ -27,6 +27,7 @@ POINTS_MAX = 2000
 JOINTS_MAX = 64
 LONGEST_S = 600.0
 ARRIVE_S = 1.5  # after the last point, when the goal does not say (`goal_time_tolerance`)
+IN_THE_WAY = "something is in the way, or the trajectory is too fast for the arm"
 SLACK = 1.001  # of a speed limit: times are rounded to nanoseconds
 
 FIRST = (
@@ -76,7 +77,7 @@ class JointTrajectory(_Ros):
 
 
 class Tolerance(_Ros):
-    """`position` (rad) at the last point; 0: as if not given."""
+    """`position` (rad) on the way, or at the last point; 0: as if not given."""
 
     name: str
     position: Annotated[Finite, Field(ge=0)] = 0.0
@@ -88,9 +89,20 @@ class TrajectoryParams(_Ros):
     """`FollowJointTrajectory.Goal`."""
 
     trajectory: JointTrajectory = JointTrajectory()
-    path_tolerance: Annotated[tuple[Tolerance, ...], FIRST, Field(max_length=0)] = ()
+    path_tolerance: Annotated[tuple[Tolerance, ...], FIRST, Field(max_length=JOINTS_MAX)] = ()
     goal_tolerance: Annotated[tuple[Tolerance, ...], FIRST, Field(max_length=JOINTS_MAX)] = ()
     goal_time_tolerance: Duration = Duration()
+
+    @property
+    def last_s(self) -> float:
+        """Seconds from the start to the last point."""
+        points = self.trajectory.points
+        return points[-1].time_from_start.seconds if points else 0.0
+
+    @property
+    def arrive_s(self) -> float:
+        """Seconds after the last point's time for the joints to be there."""
+        return self.goal_time_tolerance.seconds or ARRIVE_S
 
 
 def problem_of(asked: TrajectoryParams, limits: Limits) -> str:
@@ -104,7 +116,8 @@ def problem_of(asked: TrajectoryParams, limits: Limits) -> str:
     if len(set(names)) != len(names):
         return "trajectory.joint_names: a joint is named twice"
     known = ", ".join(limits.joints_rad)
-    for name in (*names, *(tolerance.name for tolerance in asked.goal_tolerance)):
+    tolerances = (*asked.path_tolerance, *asked.goal_tolerance)
+    for name in (*names, *(tolerance.name for tolerance in tolerances)):
         if name not in limits.joints_rad:
             return f"unknown joint {name}; the robot has {known}"
     for index, point in enumerate(points):
@@ -147,12 +160,28 @@ def too_fast(
     return ""
 
 
+def position_at(
+    points: Sequence[Point], start: tuple[float, ...], elapsed_s: float
+) -> tuple[float, ...]:
+    """Return the joints' positions (rad) after so long on the straight way from `start` through the
+    points; after the last one, that one."""
+    before_s, before = 0.0, start
+    for point in points:
+        at_s = point.time_from_start.seconds
+        if elapsed_s < at_s:
+            share = (elapsed_s - before_s) / (at_s - before_s)
+            return tuple(a + share * (b - a) for a, b in zip(before, point.positions, strict=True))
+        before_s, before = at_s, point.positions
+    return before
+
+
 def _gap_s(here: Point, there: Point) -> float:
     return there.time_from_start.seconds - here.time_from_start.seconds
 
 
 class FollowJointTrajectory(SkillBase):
-    """One goal, one trajectory. Fails with `goal_rejected` when the arm does not arrive in time.
+    """One goal, one trajectory. Fails with `goal_rejected` when the arm does not arrive in time, and
+    with `path_tolerance_violated` when a joint is too far from the target that was sent last.
 
     `sent` returns the targets in force (rad by joint), from which it begins; without it, and for
     joints that it does not name, it begins at the measured positions. A gripper that holds
@@ -202,50 +231,42 @@ class FollowJointTrajectory(SkillBase):
                 raise BadRequest(
                     f"trajectory.points[0]: {wrong} from where the arm is", hint="nothing was moved"
                 )
+        sent_s = self._ticks * self._period_s
+        sent = position_at(points, self._start_at, sent_s)
         self._ticks += 1
         elapsed_s = self._ticks * self._period_s
-        last_s = points[-1].time_from_start.seconds
+        last_s = self._asked.last_s
         self.fraction = min(0.99, elapsed_s / last_s)
-        if elapsed_s - self._period_s >= last_s:  # the last point has been sent
-            errors = {
-                n: abs(a - b) for n, a, b in zip(names, here, points[-1].positions, strict=True)
-            }
-            if all(error <= self._tolerance_rad(name) for name, error in errors.items()):
-                return Done(
-                    {"positions_rad": measured, "error_rad": round(max(errors.values()), 4)}
-                )
-            if elapsed_s > last_s + (self._asked.goal_time_tolerance.seconds or ARRIVE_S):
-                worst = max(errors, key=lambda name: errors[name])
+        if sent_s >= last_s:  # the last point has been sent
+            worst = _worst(names, here, sent, self._asked.goal_tolerance, REACHED_RAD)
+            if worst is None:
+                error = max(abs(a - b) for a, b in zip(here, sent, strict=True))
+                return Done({"positions_rad": measured, "error_rad": round(error, 4)})
+            if elapsed_s > last_s + self._asked.arrive_s:
                 raise GoalRejected(
-                    f"{worst} is {errors[worst]:.3f} rad from the last point",
-                    hint="something is in the way, or the trajectory is too fast for the arm",
+                    f"{worst[0]} is {worst[1]:.3f} rad from the last point", hint=IN_THE_WAY
                 )
-        targets = dict(zip(names, self._target(elapsed_s), strict=True))
-        return Act(action_of(targets, world.stamp_ns))
+        elif worst := _worst(names, here, sent, self._asked.path_tolerance, math.inf):
+            raise PathToleranceViolated(
+                f"{worst[0]} is {worst[1]:.3f} rad from its path", hint=IN_THE_WAY
+            )
+        targets = position_at(points, self._start_at, elapsed_s)
+        return Act(action_of(dict(zip(names, targets, strict=True)), world.stamp_ns))
 
     def withheld(self) -> None:
         """Let the clock stand: a target that moved on while the arm stood would be too fast."""
         self._ticks -= 1
 
-    def _tolerance_rad(self, name: str) -> float:
-        assert self._asked is not None, "only asked while a goal runs"
-        given = [
-            one.position
-            for one in self._asked.goal_tolerance
-            if one.name == name and one.position > 0
-        ]
-        return min(given, default=REACHED_RAD)
 
-    def _target(self, elapsed_s: float) -> tuple[float, ...]:
-        assert self._asked is not None, "only asked while a goal runs"
-        assert self._start_at is not None, "the first step has looked"
-        before_s, before = 0.0, self._start_at
-        for point in self._asked.trajectory.points:
-            at_s = point.time_from_start.seconds
-            if elapsed_s < at_s:
-                share = (elapsed_s - before_s) / (at_s - before_s)
-                return tuple(
-                    a + share * (b - a) for a, b in zip(before, point.positions, strict=True)
-                )
-            before_s, before = at_s, point.positions
-        return before
+def _worst(
+    names: tuple[str, ...],
+    here: tuple[float, ...],
+    there: tuple[float, ...],
+    tolerances: Sequence[Tolerance],
+    default_rad: float,
+) -> tuple[str, float] | None:
+    """Return the joint that is furthest outside its tolerance, and its error (rad); None: none."""
+    given = {one.name: one.position for one in tolerances if one.position > 0}
+    errors = {name: abs(a - b) for name, a, b in zip(names, here, there, strict=True)}
+    outside = {name: e for name, e in errors.items() if e > given.get(name, default_rad)}
+    return max(outside.items(), key=lambda item: item[1], default=None)

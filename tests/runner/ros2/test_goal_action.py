@@ -21,40 +21,12 @@ from vram_arbiter.runner.ros2.goal_action import INTERFACE, RunnerGoals
 pytestmark = [pytest.mark.anyio, pytest.mark.heavy]
 pytest.importorskip("cyclonedds")
 
-from cyclonedds.core import Policy, Qos  # noqa: E402
-from cyclonedds.domain import DomainParticipant  # noqa: E402
-from cyclonedds.idl.types import (  # noqa: E402
-    float32,
-    float64,
-    int8,
-    sequence,
-    uint32,
-)
-from cyclonedds.sub import DataReader  # noqa: E402
-from cyclonedds.topic import Topic  # noqa: E402
-from cyclonedds.util import duration  # noqa: E402
+from cyclonedds.idl.types import float32, float64, uint32  # noqa: E402
 
-from tests.runner.ros2.independent import (  # noqa: E402
-    QUALITY,
-    UUID_,
-    CancelRequest_,
-    CancelResponse_,
-    GoalInfo_,
-    Time_,
-    action_of,
-    client_of,
-    struct,
-    valid,
-)
+from tests.runner.ros2 import independent  # noqa: E402
+from tests.runner.ros2.independent import UUID_, struct  # noqa: E402
 
 DOMAIN = 81
-PATIENCE_S = 60.0
-LATCHED = Qos(
-    Policy.Reliability.Reliable(duration(seconds=10)),
-    Policy.Durability.TransientLocal,
-    Policy.History.KeepLast(1),
-    Policy.DataRepresentation(use_cdrv0_representation=True),
-)
 PREFIX = "openral_msgs.action.dds_.ExecuteRskill_"
 
 
@@ -71,79 +43,17 @@ Result_ = struct(PREFIX + "Result_", success=bool, failure_reason=str, trace_id=
 Feedback_ = struct(
     PREFIX + "Feedback_", progress=float32, state=str, chunk_index=uint32, chunks_total=uint32
 )
-FeedbackMessage_ = struct(PREFIX + "FeedbackMessage_", goal_id=UUID_, feedback=Feedback_)
-SendRequest_, SendResponse_, ResultRequest_, ResultResponse_ = action_of(PREFIX, Goal_, Result_)
-GoalStatus_ = struct("action_msgs.msg.dds_.GoalStatus_", goal_info=GoalInfo_, status=int8)
-GoalStatusArray_ = struct(
-    "action_msgs.msg.dds_.GoalStatusArray_", status_list=sequence[GoalStatus_]
-)
 
 
-class Commander:
-    """The client's side of the action."""
-
+class Commander(independent.Commander):
     def __init__(self, name: str) -> None:
-        participant, path = DomainParticipant(DOMAIN), f"{name}/_action/"
-        self.send = client_of(participant, path + "send_goal", SendRequest_, SendResponse_)
-        self.result = client_of(participant, path + "get_result", ResultRequest_, ResultResponse_)
-        self.cancel = client_of(participant, path + "cancel_goal", CancelRequest_, CancelResponse_)
-        feedback = Topic(participant, f"rt{path}feedback", FeedbackMessage_)
-        self._feedback = DataReader(participant, feedback, qos=QUALITY)
-        status = Topic(participant, f"rt{path}status", GoalStatusArray_)
-        self._status = DataReader(participant, status, qos=LATCHED)
-        self._asked = 0
-
-    async def call(self, service: tuple[Any, Any], request: type, *fields: Any) -> Any:
-        """Ask once server and client see each other, and wait for the reply."""
-        reader, writer = service
-        async with asyncio.timeout(PATIENCE_S):
-            while not (
-                writer.get_publication_matched_status().current_count
-                and reader.get_subscription_matched_status().current_count
-            ):
-                await asyncio.sleep(0.01)
-            self._asked += 1
-            number = self._asked
-            writer.write(request(7, number, *fields))
-            while True:
-                for reply in valid(reader):
-                    if (reply.guid, reply.seq) == (7, number):
-                        return reply
-                await asyncio.sleep(0.01)
+        super().__init__(DOMAIN, name, PREFIX, Goal_, Result_, Feedback_)
 
     async def goal(
         self, prompt: str, *, rskill: str = RSKILL, params: str = "", metadata: str = ""
     ) -> UUID_ | None:
         """Send a goal; None: it was rejected."""
-        goal_id = UUID_(uuid.uuid4().bytes)
-        goal = Goal_(rskill, "", prompt, metadata, params, 0.0)
-        told = await self.call(self.send, SendRequest_, goal_id, goal)
-        return goal_id if told.accepted else None
-
-    async def ended(self, goal_id: UUID_) -> Any:
-        return await self.call(self.result, ResultRequest_, goal_id)
-
-    async def canceled(self, goal_id: UUID_) -> Any:
-        return await self.call(self.cancel, CancelRequest_, GoalInfo_(goal_id, Time_(0, 0)))
-
-    async def heard(self, goal_id: UUID_) -> Any:
-        """Feedback on a goal, as it comes."""
-        async with asyncio.timeout(PATIENCE_S):
-            while True:
-                for message in valid(self._feedback):
-                    if message.goal_id == goal_id:
-                        return message.feedback
-                await asyncio.sleep(0.01)
-
-    async def status(self, goal_id: UUID_, expected: int) -> None:
-        """Wait until the status topic says so."""
-        async with asyncio.timeout(PATIENCE_S):
-            while True:
-                for message in valid(self._status):
-                    found = {bytes(s.goal_info.goal_id.uuid): s.status for s in message.status_list}
-                    if found.get(bytes(goal_id.uuid)) == expected:
-                        return
-                await asyncio.sleep(0.01)
+        return await self.send(rskill, "", prompt, metadata, params, 0.0)
 
 
 NO_ID = UUID_(bytes(16))
@@ -253,3 +163,18 @@ async def test_goals_that_ended_are_forgotten_in_the_end(
             assert goal_id is not None
             assert (await commander.ended(goal_id)).status == 4
         assert (await commander.ended(first)).status == 0
+
+
+async def test_every_endpoint_tells_the_hash_of_its_type(served_action: Serving) -> None:
+    """REP 2011; of a service its request's and its reply's, as rmw_cyclonedds tells them."""
+    async with served_action() as (_, commander):
+        told = await commander.type_hashes(8)
+    short = {topic.rpartition("/")[2]: text for topic, text in told.items()}
+    assert sorted(short) == [
+        "cancel_goalReply", "cancel_goalRequest", "feedback", "get_resultReply",
+        "get_resultRequest", "send_goalReply", "send_goalRequest", "status",
+    ]  # fmt: skip
+    request = "3d3c84653c1f96918086887e1dcb236faec88b81a5b14fd4cf4840065bcdf8af"
+    assert short["cancel_goalRequest"] == f"typehash=RIHS01_{request};".encode()
+    status = "6c1684b00f177d37438febe6e709fc4e2b0d4248dca4854946f9ed8b30cda83e"
+    assert short["status"] == f"typehash=RIHS01_{status};".encode()

@@ -10,9 +10,9 @@ pytest.importorskip("cyclonedds")
 from cyclonedds.idl.types import float64, int32, sequence, uint16, uint32  # noqa: E402
 
 from tests.runner.ros2.independent import Time_, struct  # noqa: E402
-from vram_arbiter.runner.ros2.messages import read, write  # noqa: E402
+from vram_arbiter.runner.sensors.ros2_types import read, write  # noqa: E402
 
-KIND = "control_msgs/FollowJointTrajectory_"
+KIND = "control_msgs/action/FollowJointTrajectory_"
 
 
 Duration_ = struct("builtin_interfaces.msg.dds_.Duration_", sec=int32, nanosec=uint32)

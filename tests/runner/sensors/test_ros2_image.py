@@ -23,10 +23,10 @@ from vram_arbiter.runner.sensors.ros2_dds import (
     dds_topic,
     domain_of,
     full_topic,
-    qos_of,
-    topic_type,
 )
+from vram_arbiter.runner.sensors.ros2_dds import reader_of as dds_reader_of
 from vram_arbiter.runner.sensors.ros2_image import RosImagePublisher, RosImageReader
+from vram_arbiter.runner.sensors.ros2_messages import IMAGE
 from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig
 from vram_arbiter.schemas.errors import ConfigError, FrameStale
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
@@ -228,22 +228,13 @@ def test_the_last_picture_of_a_publisher_that_left_is_not_shown_after_it(topic: 
     """
     from cyclonedds.core import DDSStatus, WaitSet
     from cyclonedds.domain import DomainParticipant
-    from cyclonedds.sub import DataReader
-    from cyclonedds.topic import Topic
     from cyclonedds.util import duration
-
-    from vram_arbiter.runner.sensors.ros2_messages import RosImage
 
     reader = reader_of(topic, reliability="reliable")
     assert isinstance(reader, RosImageReader)
-    reader._message = RosImage
     feed, slot = reader.slot.open(), reader.slot  # its thread is this test
     participant = DomainParticipant(int(DOMAIN))
-    source = DataReader(
-        participant,
-        Topic(participant, dds_topic(topic), topic_type(RosImage)),
-        qos=qos_of("reliable", writer=False),
-    )
+    source = dds_reader_of(participant, dds_topic(topic), IMAGE)
     source.set_status_mask(DDSStatus.SubscriptionMatched)
     waitset = WaitSet(participant)
     waitset.attach(source)

@@ -25,7 +25,12 @@ from vram_arbiter.runner.skills.ros_standins import (
 )
 from vram_arbiter.runner.skills.trajectory import ARRIVE_S, FollowJointTrajectory
 from vram_arbiter.schemas.control import ControlMode
-from vram_arbiter.schemas.errors import BadRequest, GoalRejected, ModelError
+from vram_arbiter.schemas.errors import (
+    BadRequest,
+    GoalRejected,
+    ModelError,
+    PathToleranceViolated,
+)
 from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
 from vram_arbiter.schemas.world import JointState, WorldState
 
@@ -155,7 +160,10 @@ def test_it_is_refused_or_played_within_the_limits(
         ),
         (trajectory((0.1,), (0.2,), every_s=0.0), "time_from_start must be above 0"),
         (trajectory((math.nan,)), "finite number"),
-        (trajectory((0.1,), path_tolerance=[{"name": "elbow_flex"}]), "path_tolerance"),
+        (
+            trajectory((0.1,), path_tolerance=[{"name": "elbow", "position": 0.1}]),
+            "unknown joint elbow",
+        ),
         (
             trajectory((0.1,), goal_tolerance=[{"name": "elbow", "position": 0.1}]),
             "unknown joint elbow",
@@ -181,6 +189,16 @@ def test_the_way_to_the_first_point_counts_too() -> None:
     skill = started(trajectory((1.5,), every_s=0.5))
     with pytest.raises(BadRequest, match="from where the arm is"):
         skill.step(world(elbow_flex=-1.5))
+
+
+def test_a_joint_that_leaves_its_path_fails_the_goal() -> None:
+    """By the target that was sent last, and on the way only: at its end other tolerances hold."""
+    skill = started(trajectory((0.5,), path_tolerance=[{"name": "elbow_flex", "position": 0.1}]))
+    for _ in range(6):
+        skill.step(world(elbow_flex=0.0))
+    skill.step(world(elbow_flex=0.0))  # told to be at 6/30 of the way
+    with pytest.raises(PathToleranceViolated, match=r"elbow_flex is 0\.117 rad from its path"):
+        skill.step(world(elbow_flex=0.0))
 
 
 def test_nothing_moves_on_a_stale_state() -> None:
