@@ -139,6 +139,7 @@ def test_middle_of_a_box_lands_on_the_object(scene_3: SimEnv) -> None:
     for seed in range(6):
         scene_3.reset(seed)
         model = scene_3.camera_model("front")
+        assert (model.fixed, scene_3.camera_model("wrist").fixed) == (True, False)
         for name, seen in scene_3.seen_objects("front").items():
             x0, y0, x1, y1 = seen.box
             point = model.ground_point((x0 + x1) / 2, (y0 + y1) / 2)
