@@ -38,8 +38,8 @@ class State(Enum):
 
 
 class CudaDriver:
-    """The calls of the CUDA driver that are needed, through `cuda.bindings.driver` or an object with
-    its functions."""
+    """The calls of the CUDA driver that are needed, through `cuda.bindings.driver` or an object
+    with its functions."""
 
     def __init__(self, api: Any = None) -> None:
         self._given = api

@@ -21,9 +21,9 @@ from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 from vram_arbiter.schemas.runtime.printable import printable
 
 DESCRIPTIONS = {
-    "doctor": "Examine driver, suspend, socket, permissions, versions, units, and what the arbiter says "
-    "of itself and its GPUs. Each finding names a command that resolves it; nothing is changed. "
-    "Exits 0 without a warning or error, 1 with one, 3 if the arbiter cannot be reached."
+    "doctor": "Examine driver, suspend, socket, permissions, versions, units, and what the arbiter "
+    "says of itself and its GPUs. Each finding names a command that resolves it; nothing is "
+    "changed. Exits 0 without a warning or error, 1 with one, 3 if the arbiter cannot be reached."
 }
 
 CHECKS: Final[Checks[Machine]] = (
