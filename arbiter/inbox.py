@@ -14,7 +14,7 @@ import logging
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from vram_arbiter.arbiter.core.arbiter import Arbiter
@@ -22,7 +22,7 @@ from vram_arbiter.arbiter.core.effects import Effect
 from vram_arbiter.arbiter.core.events import Event, Resumed, Tick
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import STATUS_DETAILS_PAGE, STATUS_PAGE
-from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import StatusReply
 
@@ -174,10 +174,6 @@ class Inbox:
         """A page of the status as `reader` may see it; None: an operator."""
         limit = STATUS_DETAILS_PAGE if details else STATUS_PAGE
         return self._core.status(self._clock(), reader, after, limit, details=details)
-
-    def leases(self, ids: Iterable[LeaseId]) -> StatusReply:
-        """The status with these leases alone, without tokens."""
-        return self._core.leases(ids, self._clock())
 
     def why(self, consumer: str) -> WhyReply:
         return self._core.why(consumer, self._clock())

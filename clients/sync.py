@@ -19,7 +19,7 @@ import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager
-from functools import partial
+from functools import partial, wraps
 from threading import Thread, main_thread
 from types import TracebackType
 from typing import Any, Concatenate, Self
@@ -37,13 +37,6 @@ from vram_arbiter.clients.lease import AsyncForeignUse, AsyncLease, AsyncUse, Le
 from vram_arbiter.schemas.errors import BadState, VramError
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.wire.explained import WhyReply
-from vram_arbiter.schemas.wire.replies import (
-    HistoryReply,
-    PingReply,
-    PrepareReply,
-    StatusReply,
-)
 from vram_arbiter.schemas.wire.requests import Request, Role
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
@@ -125,73 +118,95 @@ class _Portal:
             raise
 
 
-class Lease:
+class _Blocking[Twin]:
+    """What a thread sees of an object that lives in the background thread."""
+
+    def __init__(self, portal: _Portal, twin: Twin) -> None:
+        self._portal = portal
+        self._twin = twin
+
+
+def _blocking[Twin, **P, T](
+    work: Callable[Concatenate[Twin, P], Awaitable[T]],
+) -> Callable[Concatenate[_Blocking[Twin], P], T]:
+    """Return the blocking method of an async one, with its parameters and its docstring."""
+
+    @wraps(work)
+    def method(self: _Blocking[Twin], /, *arguments: P.args, **named: P.kwargs) -> T:
+        return self._portal.call(work, self._twin, *arguments, **named)
+
+    return method
+
+
+class Lease(_Blocking[AsyncLease]):
     """A granted lease. `give_up` runs the `unload` handler; `release` reports bytes that the holder
     freed itself."""
 
-    def __init__(self, portal: _Portal, lease: AsyncLease) -> None:
-        self._portal = portal
-        self._lease = lease
+    ready = _blocking(AsyncLease.ready)
+    oom = _blocking(AsyncLease.oom)
+    park = _blocking(AsyncLease.park)
+    reacquire = _blocking(AsyncLease.reacquire)
+    wait_returned = _blocking(AsyncLease.wait_returned)
+    release = _blocking(AsyncLease.release)
+    give_up = _blocking(AsyncLease.give_up)
+    wait_change = _blocking(AsyncLease.wait_change)
+    wait_gone = _blocking(AsyncLease.wait_gone)
 
     @property
     def lease_id(self) -> str:
-        return self._lease.lease_id
+        return self._twin.lease_id
 
     @property
     def token(self) -> Token:
         """Fencing token (epoch, serial). A process that has it and the lease id can mark uses."""
-        return self._lease.token
+        return self._twin.token
 
     @property
     def spec(self) -> LeaseSpec:
         """What was asked for."""
-        return self._lease.spec
+        return self._twin.spec
 
     @property
     def gpu(self) -> str:
         """UUID of the GPU that was granted."""
-        return self._lease.gpu
+        return self._twin.gpu
 
     @property
     def state(self) -> LeaseState:
-        return self._lease.state
+        return self._twin.state
 
     @property
     def uses(self) -> int:
         """Number of in-flight uses of this holder."""
-        return self._lease.uses
+        return self._twin.uses
 
     @property
     def revoking(self) -> bool:
         """Whether the lease is on its way out, or away."""
-        return self._lease.revoking
+        return self._twin.revoking
 
     @property
     def evicted(self) -> r.Eviction | None:
         """Why the arbiter revoked the lease; None: it did not."""
-        return self._lease.evicted
+        return self._twin.evicted
 
     @property
     def given_up(self) -> bool:
         """Whether the holder itself ended the lease (`give_up`)."""
-        return self._lease.given_up
+        return self._twin.given_up
 
     @property
     def error(self) -> VramError | None:
         """Why the lease is gone, if its holder did not end it."""
-        return self._lease.error
+        return self._twin.error
 
     def __repr__(self) -> str:
-        return repr(self._lease)
-
-    def ready(self, measured_bytes: int | None = None) -> None:
-        """Report that the model is loaded; see `AsyncLease.ready`."""
-        self._portal.call(self._lease.ready, measured_bytes)
+        return repr(self._twin)
 
     @contextmanager
     def use(self, label: str = "") -> Iterator["Use"]:
         """Mark a busy interval: the holder is not evicted inside it; see `AsyncLease.use`."""
-        interval = self._lease.use(label)
+        interval = self._twin.use(label)
         use = self._portal.call(interval.__aenter__)
         use_context.enter(use.use_id, use.name)  # the background task entered it for itself only
         try:
@@ -199,78 +214,36 @@ class Lease:
         finally:
             self._portal.call(interval.__aexit__, None, None, None)
 
-    def oom(self, requested_bytes: int, allocated_bytes: int | None = None) -> None:
-        """Report an allocation that failed; see `AsyncLease.oom`."""
-        self._portal.call(self._lease.oom, requested_bytes, allocated_bytes)
 
-    def park(self) -> None:
-        """Leave the GPU and keep the weights in host RAM; see `AsyncLease.park`."""
-        self._portal.call(self._lease.park)
-
-    def reacquire(self, wait_timeout_s: float | None = None) -> None:
-        """Come back from `standby` or `parked`; see `AsyncLease.reacquire`."""
-        self._portal.call(self._lease.reacquire, wait_timeout_s)
-
-    def wait_returned(self) -> None:
-        """Wait until an evicted lease is granted again. Raises what ended it."""
-        self._portal.call(self._lease.wait_returned)
-
-    def release(self, *, exiting: bool = False) -> None:
-        """Report that the bytes are freed; see `AsyncLease.release`."""
-        self._portal.call(self._lease.release, exiting=exiting)
-
-    def give_up(self) -> None:
-        """Wait for uses in flight, then run `unload` and release. Idempotent."""
-        self._portal.call(self._lease.give_up)
-
-    def wait_change(self, seen: LeaseState) -> LeaseState:
-        """Wait until `state` differs from `seen`, and return it; see `AsyncLease.wait_change`."""
-        return self._portal.call(self._lease.wait_change, seen)
-
-    def wait_gone(self) -> None:
-        """Wait until the lease has ended and its `unload`, if any, is done."""
-        self._portal.call(self._lease.wait_gone)
-
-
-class Use:
+class Use(_Blocking[AsyncUse]):
     """A use on the holder's own lease; made by `Lease.use`."""
-
-    def __init__(self, portal: _Portal, use: AsyncUse) -> None:
-        self._portal = portal
-        self._use = use
 
     @property
     def use_id(self) -> str:
-        return self._use.use_id
+        return self._twin.use_id
 
 
-class ForeignUse:
+class ForeignUse(_Blocking[AsyncForeignUse]):
     """A use on the lease of another process; see `AsyncForeignUse`."""
 
-    def __init__(self, portal: _Portal, use: AsyncForeignUse) -> None:
-        self._portal = portal
-        self._use = use
+    end = _blocking(AsyncForeignUse.end)
 
     @property
     def lease_id(self) -> str:
-        return self._use.lease_id
+        return self._twin.lease_id
 
     @property
     def token(self) -> Token:
-        return self._use.token
+        return self._twin.token
 
     @property
     def use_id(self) -> str:
-        return self._use.use_id
+        return self._twin.use_id
 
     @property
     def lost(self) -> VramError | None:
         """Why the use ended early, or None."""
-        return self._use.lost
-
-    def end(self) -> None:
-        """End the use. Idempotent."""
-        self._portal.call(self._use.end)
+        return self._twin.lost
 
 
 def _block[C, **P](
@@ -289,7 +262,7 @@ def _block[C, **P](
     return with_signature_of(acquire, lease)
 
 
-class Client:
+class Client(_Blocking[AsyncClient]):
     """One connection to the arbiter, open inside `with`. Raises as `clients.client.AsyncClient`.
 
     In a forked child it raises BadState, and leaving the block only forgets: the parent owns it.
@@ -303,16 +276,14 @@ class Client:
         role: Role = "client",
         connect_timeout_s: float = CONNECT_TIMEOUT_S,
     ) -> None:
-        self._client = AsyncClient(
-            name, endpoint=endpoint, role=role, connect_timeout_s=connect_timeout_s
-        )
-        self._portal = _Portal()
+        made = AsyncClient(name, endpoint=endpoint, role=role, connect_timeout_s=connect_timeout_s)
+        super().__init__(_Portal(), made)
         self._connection: AbstractContextManager[Any]
         self._dropped: weakref.finalize[Any, Any]
 
     # -- connection --------------------------------------------------------------------------------
     def __enter__(self) -> Self:
-        self._connection = self._portal.start().wrap_async_context_manager(self._client)
+        self._connection = self._portal.start().wrap_async_context_manager(self._twin)
         try:
             self._connection.__enter__()
         except BaseException:
@@ -333,26 +304,26 @@ class Client:
 
     @property
     def name(self) -> str:
-        return self._client.name
+        return self._twin.name
 
     @property
     def endpoint(self) -> str:
-        return self._client.endpoint
+        return self._twin.endpoint
 
     @property
     def connected(self) -> bool:
         """Whether the arbiter answered this connection's hello."""
-        return self._client.connected
+        return self._twin.connected
 
     @property
     def epoch(self) -> int | None:
         """Number of the daemon's start; None before the first answer."""
-        return self._client.epoch
+        return self._twin.epoch
 
     @property
     def leases(self) -> Sequence[Lease]:
         """Leases that this client holds now."""
-        return tuple(Lease(self._portal, lease) for lease in self._client.leases)
+        return tuple(Lease(self._portal, lease) for lease in self._twin.leases)
 
     # -- leases ------------------------------------------------------------------------------------
     def acquire(
@@ -383,7 +354,7 @@ class Client:
             safe_point_eta_s=safe_point_eta_s,
         )
         granted = self._portal.call(
-            self._client.acquire,
+            self._twin.acquire,
             spec,
             wait_timeout_s,
             vram=vram,
@@ -405,7 +376,7 @@ class Client:
         timeout_s: float = REQUEST_TIMEOUT_S,
     ) -> ForeignUse:
         """Begin a use on the lease of another process, by its token; `end` it."""
-        use = self._portal.call(self._client.begin_use, lease_id, token, label, timeout_s=timeout_s)
+        use = self._portal.call(self._twin.begin_use, lease_id, token, label, timeout_s=timeout_s)
         use_context.enter(use.use_id, use.name)
         return ForeignUse(self._portal, use)
 
@@ -421,36 +392,23 @@ class Client:
     # -- questions ---------------------------------------------------------------------------------
     def ask[R](self, request: Request[R], *, timeout_s: float = REQUEST_TIMEOUT_S) -> R:
         """Send any request of `schemas.wire.requests`, and return its reply."""
-        ask: Callable[..., Awaitable[R]] = self._client.ask
+        ask: Callable[..., Awaitable[R]] = self._twin.ask
         return self._portal.call(ask, request, timeout_s=timeout_s)
 
-    def status(self, *, details: bool = False) -> StatusReply:
-        """Return the state of everything; see `AsyncClient.status`."""
-        return self._portal.call(self._client.status, details=details)
-
-    def why(self, consumer: str) -> WhyReply:
-        """Return what blocks this consumer; see `AsyncClient.why`."""
-        return self._portal.call(self._client.why, consumer)
-
-    def history(self, after: int = 0, limit: int = 500, kinds: Sequence[str] = ()) -> HistoryReply:
-        """Return events after sequence number `after`, oldest first."""
-        return self._portal.call(self._client.history, after, limit, kinds)
-
-    def prepare(self, consumer: str) -> PrepareReply:
-        """Tell a consumer that its model is wanted soon; see `AsyncClient.prepare`."""
-        return self._portal.call(self._client.prepare, consumer)
+    status = _blocking(AsyncClient.status)
+    why = _blocking(AsyncClient.why)
+    history = _blocking(AsyncClient.history)
+    prepare = _blocking(AsyncClient.prepare)
 
     def on_prepare(self, hinted: Callable[[str], object]) -> None:
         """Call `hinted`, on the client's own thread, when this consumer's model is wanted soon."""
-        self._client.on_prepare(hinted)
+        self._twin.on_prepare(hinted)
 
-    def ping(self, *, timeout_s: float = 2.0) -> PingReply:
-        """Wait for a sign of life."""
-        return self._portal.call(self._client.ping, timeout_s=timeout_s)
+    ping = _blocking(AsyncClient.ping)
 
     def subscribe(self) -> Iterator[JsonMap]:
         """Yield history events from now on; blocks for the next one. Close the iterator to stop."""
-        return self._iterate(self._client.subscribe())
+        return self._iterate(self._twin.subscribe())
 
     # -- steps -------------------------------------------------------------------------------------
     def _iterate[T](self, found: AsyncIterator[T]) -> Iterator[T]:

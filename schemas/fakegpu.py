@@ -23,8 +23,8 @@ comes back `release_lag_s` late, also that of a dead process; what does not fit 
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -460,38 +460,23 @@ def _remove(name: str) -> Callable[[GpuState], Change]:
 
 
 # -- making one
-@dataclass(frozen=True, slots=True)
-class FolderPlan:
-    """How to bring a folder to hold a GPU: files to write (by name), process files to remove,
-    whether the log starts anew."""
-
-    write: Mapping[str, str] = field(default_factory=dict)
-    remove: tuple[str, ...] = ()
-    fresh_log: bool = False
-
-
-def plan_folder(
-    wanted: FakeGpuConfig, existing: str | None, process_files: Iterable[str]
-) -> FolderPlan:
-    """Make a GPU, or keep the one that is there: a restarted daemon must find what living
-    processes still hold.
+def new_gpu(wanted: FakeGpuConfig, existing: str | None, *, in_use: bool) -> FakeGpuConfig | None:
+    """Return the GPU with which a folder begins anew, without process files and log; None keeps the
+    one that is there: a restarted daemon must find what living processes still hold.
 
     Process files of an earlier boot are void. Raises ConfigError if the GPU is in use with another
     capacity.
     """
-    processes = tuple(process_files)
     if existing is None:
-        return FolderPlan({GPU_FILE: dump_config(wanted)}, processes, fresh_log=True)
+        return wanted
     current = parse_config(existing)
-    fresh = {GPU_FILE: dump_config(wanted.model_copy(update={"uuid": current.uuid}))}
-    if current.boot_id != wanted.boot_id:
-        return FolderPlan(fresh, processes, fresh_log=True)
-    if current.capacity_bytes == wanted.capacity_bytes:
-        return FolderPlan()
-    if processes:
-        raise ConfigError(
-            f"a simulated GPU of {format_bytes(current.capacity_bytes)} is in use here, not one "
-            f"of {format_bytes(wanted.capacity_bytes)}",
-            hint="stop the processes that use it, or choose another runtime folder",
-        )
-    return FolderPlan(fresh, fresh_log=True)
+    if current.boot_id == wanted.boot_id:
+        if current.capacity_bytes == wanted.capacity_bytes:
+            return None
+        if in_use:
+            raise ConfigError(
+                f"a simulated GPU of {format_bytes(current.capacity_bytes)} is in use here, not "
+                f"one of {format_bytes(wanted.capacity_bytes)}",
+                hint="stop the processes that use it, or choose another runtime folder",
+            )
+    return wanted.model_copy(update={"uuid": current.uuid})

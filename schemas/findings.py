@@ -89,7 +89,7 @@ def wrong(problem: str, *path: str | int) -> RuleError:
 
 
 def dotted(path: Path) -> str:
-    """`verify.poll_s[0]`"""
+    """`actuators_required[0].kind`"""
     text = ""
     for part in path:
         text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)

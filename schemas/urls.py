@@ -23,11 +23,11 @@ def collector_url(text: str) -> str:
     return http_url(text, "the URL of a collector such as http://localhost:4318")
 
 
-def webhook_url(text: str) -> str:
-    """Return `text`. Raises ValueError unless it is the URL of a webhook."""
-    parts = urlsplit(http_url(text, "the URL of a webhook such as https://HOST/PATH"))
+def request_url(text: str, expected: str) -> str:
+    """Return `text`. Raises ValueError unless it is a URL that requests go to as it stands."""
+    parts = urlsplit(http_url(text, expected))
     if parts.username is not None or parts.fragment:
-        raise ValueError(f"a webhook has neither user nor fragment, got {_shown(text)!r}")
+        raise ValueError(f"expected a URL without user and fragment, got {_shown(text)!r}")
     if not text.isascii() or not text.isprintable() or " " in text:
         raise ValueError(
             f"expected a URL without spaces and special characters, got {_shown(text)!r}"

@@ -10,7 +10,7 @@ same effects.
 It must not know how effects are performed, nor that a wire exists.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Mapping, Set
 from dataclasses import replace
 from math import inf
 from typing import Any
@@ -28,7 +28,7 @@ from vram_arbiter.arbiter.core.requests import operators, recovery, requests, se
 from vram_arbiter.arbiter.core.scheduling import grants
 from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.core.verification import schedule
-from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import StatusReply
@@ -203,11 +203,6 @@ class Arbiter:
             shown = why.details(self._core, [lease.lease_id for lease in page.leases])
             page = replace(page, details=shown)
         return page
-
-    def leases(self, ids: Iterable[LeaseId], now: float) -> StatusReply:
-        """Return the status with these leases alone, without tokens."""
-        self._core.now = max(self._core.now, now)
-        return status.status(self._core, ProcessKey(0, 0), only=ids)
 
     def why(self, consumer: str, now: float) -> WhyReply:
         """Explain why a consumer is not running."""

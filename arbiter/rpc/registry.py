@@ -7,14 +7,14 @@ and never held anything, leaves for a new one. Must not know requests, replies o
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.rpc.peer import check_visible, how_to_operate, is_operator
 from vram_arbiter.schemas.errors import LimitExceeded, NotPermitted
-from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey
+from vram_arbiter.schemas.ids import ClientId, ProcessKey
 from vram_arbiter.schemas.runtime.peercred import Peer
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.explained import WhyReply
@@ -47,8 +47,6 @@ class Decisions(Protocol):
         *,
         details: bool = False,
     ) -> StatusReply: ...
-
-    def leases(self, ids: Iterable[LeaseId]) -> StatusReply: ...
 
     def why(self, consumer: str) -> WhyReply: ...
 

@@ -323,10 +323,7 @@ class SessionTable:
         reader: ProcessKey | None,
         request: w.Status,
     ) -> None:
-        if request.leases:
-            status = self._decisions.leases(request.leases)
-        else:
-            status = self._decisions.status(reader, request.after, details=request.details)
+        status = self._decisions.status(reader, request.after, details=request.details)
         problems = tuple(self._problems())
         self.reply(client, re, replace(status, problems=problems, daemon=self._daemon()))
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, ClassVar, Final, Protocol
+from typing import Any, ClassVar, Final
 
 from vram_arbiter.clients.foreign.actions import Deadline
 from vram_arbiter.schemas.errors import ActionFailed, CheckpointUnsupported
@@ -37,117 +37,15 @@ class State(Enum):
     FAILED = "failed"
 
 
-class CheckpointDriver(Protocol):
-    """The calls of the CUDA driver that are needed. Each raises ActionFailed."""
-
-    def check(self) -> None:
-        """Raises CheckpointUnsupported where the driver lacks these calls."""
-        ...
-
-    def state(self, pid: int) -> State: ...
-
-    def lock(self, pid: int, timeout_ms: int) -> None: ...
-
-    def checkpoint(self, pid: int) -> None: ...
-
-    def restore(self, pid: int) -> None: ...
-
-    def unlock(self, pid: int) -> None: ...
-
-
-@dataclass(slots=True)
-class CheckpointAction:
-    """Suspend all CUDA processes of a program, or none of them."""
-
-    driver: CheckpointDriver
-    timeout_s: float
-    machine: str = platform.machine()
-    proc: Path = procfs.PROC
-    name: ClassVar = "cuda-checkpoint"
-    keeps_context: ClassVar = False
-    parks: ClassVar = True
-    suspends: ClassVar = True
-
-    def check(self) -> None:
-        if self.machine != MACHINE:
-            raise CheckpointUnsupported(
-                f"cuda-checkpoint needs {MACHINE}, this machine is {self.machine}",
-                hint="choose another --on-evict action, such as stop",
-            )
-        _check_privileges(self.proc)
-        self.driver.check()
-
-    def busy(self) -> int | None:
-        return None  # `lock` waits for the work that was submitted
-
-    def free(self, pids: Sequence[int]) -> None:
-        """Lock all processes, then checkpoint them. What was done is undone where one fails."""
-        deadline = Deadline(self.timeout_s)
-        ours = [pid for pid in pids if self.driver.state(pid) is State.RUNNING]
-        done: list[int] = []
-        try:
-            for pid in ours:
-                left_s = deadline.left_s(f"cuda-checkpoint: lock of pid {pid}")
-                self.driver.lock(pid, max(1, int(left_s * 1000)))
-                done.append(pid)
-            for pid in ours:
-                self.driver.checkpoint(pid)
-        except ActionFailed as error:
-            broken = self._resume(done)
-            raise ActionFailed(
-                error.message + (f"; {broken}" if broken else "; the program continues"),
-                hint=error.hint,
-                details=error.details,
-            ) from error
-
-    def restore(self, pids: Sequence[int]) -> None:
-        if broken := self._resume(pids):
-            raise ActionFailed(broken, hint="the program stays suspended: end it, start it again")
-
-    def _resume(self, pids: Sequence[int]) -> str:
-        """Restore and unlock whatever is suspended. Return what went wrong."""
-        problems: list[str] = []
-        for pid in pids:
-            try:
-                state = self.driver.state(pid)
-                if state is State.CHECKPOINTED:
-                    self.driver.restore(pid)
-                    state = State.LOCKED
-                if state is State.LOCKED:
-                    self.driver.unlock(pid)
-                elif state is State.FAILED:
-                    problems.append(f"the CUDA state of pid {pid} is broken")
-            except ActionFailed as error:
-                problems.append(error.message)
-        return "; ".join(problems)
-
-
-def _check_privileges(proc: Path) -> None:
-    """Raises CheckpointUnsupported where Yama forbids to control an own child."""
-    try:
-        scope = int((proc / "sys/kernel/yama/ptrace_scope").read_text())
-    except FileNotFoundError:
-        return  # without Yama the same user is enough
-    capable = False
-    for line in (proc / "self/status").read_text().splitlines():
-        if line.startswith("CapEff:"):
-            capable = bool(int(line.split()[1], 16) >> CAP_SYS_PTRACE & 1)
-    if scope >= NO_ATTACH or (scope == CAP_NEEDED and not capable):
-        raise CheckpointUnsupported(
-            f"cuda-checkpoint may not control processes: kernel.yama.ptrace_scope is {scope}",
-            hint="run vramctl with CAP_SYS_PTRACE"
-            if scope < NO_ATTACH
-            else "no process may attach until the next boot",
-        )
-
-
 class CudaDriver:
-    """`CheckpointDriver` through `cuda.bindings.driver`, or an object with its functions."""
+    """The calls of the CUDA driver that are needed, through `cuda.bindings.driver` or an object
+    with its functions."""
 
     def __init__(self, api: Any = None) -> None:
         self._given = api
 
     def check(self) -> None:
+        """Raises CheckpointUnsupported where the driver lacks these calls."""
         api = self._api()
         try:
             result, version = api.cuDriverGetVersion()
@@ -184,18 +82,10 @@ class CudaDriver:
     def lock(self, pid: int, timeout_ms: int) -> None:
         arguments = self._api().CUcheckpointLockArgs()
         arguments.timeoutMs = timeout_ms
-        self._do("Lock", pid, arguments)
+        self.step("Lock", pid, arguments)
 
-    def checkpoint(self, pid: int) -> None:
-        self._do("Checkpoint", pid, None)
-
-    def restore(self, pid: int) -> None:
-        self._do("Restore", pid, None)
-
-    def unlock(self, pid: int) -> None:
-        self._do("Unlock", pid, None)
-
-    def _do(self, what: str, pid: int, arguments: object) -> None:
+    def step(self, what: str, pid: int, arguments: object = None) -> None:
+        """Lock, Checkpoint, Restore or Unlock a process. Raises ActionFailed."""
         api = self._api()
         (result,) = getattr(api, f"cuCheckpointProcess{what}")(pid, arguments)
         if result == api.CUresult.CUDA_SUCCESS:
@@ -224,3 +114,89 @@ class CudaDriver:
                 ) from error
             self._given = driver
         return self._given
+
+
+@dataclass(slots=True)
+class CheckpointAction:
+    """Suspend all CUDA processes of a program, or none of them."""
+
+    driver: CudaDriver
+    timeout_s: float
+    machine: str = platform.machine()
+    proc: Path = procfs.PROC
+    name: ClassVar = "cuda-checkpoint"
+    keeps_context: ClassVar = False
+    parks: ClassVar = True
+    suspends: ClassVar = True
+
+    def check(self) -> None:
+        if self.machine != MACHINE:
+            raise CheckpointUnsupported(
+                f"cuda-checkpoint needs {MACHINE}, this machine is {self.machine}",
+                hint="choose another --on-evict action, such as stop",
+            )
+        _check_privileges(self.proc)
+        self.driver.check()
+
+    def busy(self) -> int | None:
+        return None  # `lock` waits for the work that was submitted
+
+    def free(self, pids: Sequence[int]) -> None:
+        """Lock all processes, then checkpoint them. What was done is undone where one fails."""
+        deadline = Deadline(self.timeout_s)
+        ours = [pid for pid in pids if self.driver.state(pid) is State.RUNNING]
+        done: list[int] = []
+        try:
+            for pid in ours:
+                left_s = deadline.left_s(f"cuda-checkpoint: lock of pid {pid}")
+                self.driver.lock(pid, max(1, int(left_s * 1000)))
+                done.append(pid)
+            for pid in ours:
+                self.driver.step("Checkpoint", pid)
+        except ActionFailed as error:
+            broken = self._resume(done)
+            raise ActionFailed(
+                error.message + (f"; {broken}" if broken else "; the program continues"),
+                hint=error.hint,
+                details=error.details,
+            ) from error
+
+    def restore(self, pids: Sequence[int]) -> None:
+        if broken := self._resume(pids):
+            raise ActionFailed(broken, hint="the program stays suspended: end it, start it again")
+
+    def _resume(self, pids: Sequence[int]) -> str:
+        """Restore and unlock whatever is suspended. Return what went wrong."""
+        problems: list[str] = []
+        for pid in pids:
+            try:
+                state = self.driver.state(pid)
+                if state is State.CHECKPOINTED:
+                    self.driver.step("Restore", pid)
+                    state = State.LOCKED
+                if state is State.LOCKED:
+                    self.driver.step("Unlock", pid)
+                elif state is State.FAILED:
+                    problems.append(f"the CUDA state of pid {pid} is broken")
+            except ActionFailed as error:
+                problems.append(error.message)
+        return "; ".join(problems)
+
+
+def _check_privileges(proc: Path) -> None:
+    """Raises CheckpointUnsupported where Yama forbids to control an own child."""
+    try:
+        scope = int((proc / "sys/kernel/yama/ptrace_scope").read_text())
+    except FileNotFoundError:
+        return  # without Yama the same user is enough
+    capable = False
+    for line in (proc / "self/status").read_text().splitlines():
+        if line.startswith("CapEff:"):
+            capable = bool(int(line.split()[1], 16) >> CAP_SYS_PTRACE & 1)
+    if scope >= NO_ATTACH or (scope == CAP_NEEDED and not capable):
+        raise CheckpointUnsupported(
+            f"cuda-checkpoint may not control processes: kernel.yama.ptrace_scope is {scope}",
+            hint="run vramctl with CAP_SYS_PTRACE"
+            if scope < NO_ATTACH
+            else "no process may attach until the next boot",
+        )

@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 from vram_arbiter.clients.foreign.actions import Deadline
 from vram_arbiter.schemas.errors import ActionFailed
 from vram_arbiter.schemas.runtime.printable import printable
+from vram_arbiter.schemas.urls import request_url
 
 OTHER_API: Final = "is this the program's address, and a version of it that is supported?"
 ANSWER_MAX_BYTES: Final = 4 << 20
@@ -50,17 +51,11 @@ def checked_url(url: str, *, remote: bool) -> str:
 
     `remote`: hosts other than this one are allowed.
     """
-    parts = urlsplit(url)
-    if parts.scheme not in ("http", "https") or not parts.hostname:
-        raise ValueError(f"expected a URL such as http://127.0.0.1:8000, got {url!r}")
-    if parts.username is not None or parts.fragment or not url.isascii() or not url.isprintable():
-        raise ValueError(f"expected a URL without user, fragment and special characters: {url!r}")
-    if " " in url or parts.port == 0:  # `port` raises ValueError where it is no port
-        raise ValueError(f"expected a URL without spaces and with a port from 1 on, got {url!r}")
-    if not remote and not _is_here(parts.hostname):
+    host = urlsplit(request_url(url, "a URL such as http://127.0.0.1:8000")).hostname or ""
+    if not remote and not _is_here(host):
         raise ValueError(
-            f"{parts.hostname} is not a loopback host: the program runs on this machine; "
-            "--allow-remote calls it anyway"
+            f"{host} is not a loopback host: the program runs on this machine; --allow-remote "
+            "calls it anyway"
         )
     return url.rstrip("/")
 

@@ -73,7 +73,6 @@ class Observer:
         self._present = Present(self._client, self._heard)
         self._record = UsageRecord()
         self._woken = asyncio.Event()
-        self._touched: set[str] = set()  # leases of events since the last look
         self._feed = PageFeed(self._client, self._record, self._woken.set)
         self._hooks = Runner(
             config.hooks, lambda hook, one: act(hook, one, options.endpoint), saved.pending
@@ -156,7 +155,6 @@ class Observer:
                 self._exports.take(events)
                 self._feed.happened(events)
                 if events:
-                    self._touched.update(one["lease_id"] for one in events if one.get("lease_id"))
                     self._woken.set()
                 if not started and self._cursor.numbering:
                     started = True
@@ -167,8 +165,7 @@ class Observer:
         """Look at the arbiter after each event, and now and then without one."""
         while True:
             self._woken.clear()
-            touched, self._touched = self._touched, set()
-            look = await self._present.look(touched=touched)
+            look = await self._present.look()
             if look is not None:
                 await self._feed.publish(look)
             read = self._feed.read

@@ -6,9 +6,9 @@ No key is required: an empty file is the default configuration.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.runtime.endpoints import check_endpoint
@@ -94,32 +94,12 @@ class VerifyConfig(_Section):
 
     timeout_s: Seconds = d.VERIFY_TIMEOUT_S
     """A verification ends with a verdict after this long."""
-    poll_s: Annotated[
-        tuple[Annotated[float, Field(ge=0.001, le=10)], ...],
-        Field(min_length=1, max_length=16),
-    ] = d.VERIFY_POLL_S
-    """Pauses between samples, the first one while memory usually comes back; the last one
-    repeats."""
-    poll_until_s: Annotated[tuple[Seconds, ...], Field(max_length=15)] = d.VERIFY_POLL_UNTIL_S
-    """Until when after the release each pause but the last is kept. A consumer known to take longer
-    is looked at for longer."""
     confirm_s: Annotated[float, Field(ge=0.001, le=1)] = d.VERIFY_CONFIRM_S
     """After a sample that is on target: when the second one is taken, which has to agree."""
     slow_poll_s: Seconds = d.VERIFY_SLOW_POLL_S
     """Pause between samples after a verdict that does not allow a grant."""
     tolerance_bytes: ByteSize = d.VERIFY_TOLERANCE_BYTES
     """Difference between expected and measured bytes that is no difference."""
-
-    @model_validator(mode="after")
-    def _one_end_per_pause(self) -> Self:
-        if len(self.poll_until_s) != len(self.poll_s) - 1 or list(self.poll_until_s) != sorted(
-            self.poll_until_s
-        ):
-            raise ValueError(
-                f"poll_until_s needs {len(self.poll_s) - 1} rising times, one for each of poll_s "
-                "but the last"
-            )
-        return self
 
 
 class ProbeConfig(_Section):

@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from vram_arbiter.schemas.findings import did_you_mean
-from vram_arbiter.schemas.urls import http_address, webhook_url
+from vram_arbiter.schemas.urls import http_address, request_url
 from vram_arbiter.schemas.wire.notes import DAEMON_KINDS, NOTES
 from vram_arbiter.schemas.yamltext import parse_yaml, validated, without_empty
 
@@ -118,7 +118,8 @@ class Hook(_Section):
     @field_validator("webhook")
     @classmethod
     def _a_webhook(cls, value: str | None) -> str | None:
-        return None if value is None else webhook_url(value)
+        expected = "the URL of a webhook such as https://HOST/PATH"
+        return None if value is None else request_url(value, expected)
 
     @model_validator(mode="after")
     def _one_action(self) -> Self:

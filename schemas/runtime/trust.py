@@ -10,8 +10,9 @@ It must not know what is said on the socket.
 import os
 import pwd
 import socket
-from collections.abc import Mapping
-from typing import Final, Literal
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Literal
 
 from vram_arbiter.schemas.errors import ConfigError, UntrustedServer
 from vram_arbiter.schemas.runtime.peercred import credentials
@@ -31,7 +32,8 @@ SERVICE_USERS: Final[Mapping[Program, str]] = {
 _TABLES: Final = ("/proc/self/net/tcp", "/proc/self/net/tcp6")
 _NOT_ACCEPTED: Final = ("01", "03")  # established, its handshake
 _LISTEN: Final = "0A"
-_LOOPBACK: Final = ("0100007F", "0000000000000000FFFF00000100007F")
+_MAPPED: Final = bytes(10) + b"\xff\xff"
+"""Before an IPv4 address in the table of IPv6."""
 _ANY: Final = ("00000000", "0" * 32)
 
 
@@ -52,14 +54,14 @@ def server_uid(connected: socket.socket) -> int:
 
 
 def port_uids(connected: socket.socket) -> set[int]:
-    """The users of the process at the other end of a connection to a port of 127.0.0.1.
+    """The users of the process at the other end of a loopback connection over TCP.
 
     That is the owner of the other end; while no process has accepted it, of every socket that
     listens there. Empty: there is no other end any more. Raises OSError.
     """
-    here, there = connected.getsockname(), connected.getpeername()
-    ours = [f"{address}:{here[1]:04X}" for address in _LOOPBACK]
-    theirs = [f"{address}:{there[1]:04X}" for address in _LOOPBACK]
+    there = connected.getpeername()
+    ours = _in_tables(connected.family, connected.getsockname())
+    theirs = _in_tables(connected.family, there)
     listens = theirs + [f"{address}:{there[1]:04X}" for address in _ANY]
     listening: set[int] = set()
     waiting = False
@@ -78,6 +80,15 @@ def port_uids(connected: socket.socket) -> set[int]:
             elif state == _LISTEN and local in listens:
                 listening.add(int(uid))
     return listening if waiting else set()
+
+
+def _in_tables(family: int, end: Sequence[Any]) -> list[str]:
+    """An end as the kernel's tables have it: words in the machine's order, and the port. One of
+    IPv4 may stand in both tables."""
+    packed = socket.inet_pton(family, end[0].partition("%")[0])
+    found = [packed, _MAPPED + packed] if family == socket.AF_INET else [packed]
+    words = ["".join(f"{word:08X}" for (word,) in struct.iter_unpack("=I", one)) for one in found]
+    return [f"{address}:{end[1]:04X}" for address in words]
 
 
 def frame_uid(peer_address: object) -> int | None:

@@ -191,13 +191,10 @@ class Oom(OnLease[r.OomReply], op="oom"):
 class Status(Question[r.StatusReply], op="status"):
     """The state of everything. Leases come in pages: `after` is the `next` of the page before.
     `details`: with declared and measured bytes, and why each waiter waits; its pages are
-    shorter. `leases`: with these alone, as far as they are not over, and without tokens."""
+    shorter."""
 
     WHOLE: ClassVar = False  # a question for everything says nothing of its pages
     details: bool = False
-    leases: Annotated[
-        tuple[LeaseIdText, ...], Limits(max_length=d.STATUS_PAGE, fail_fast=True)
-    ] = ()
     after: (
         tuple[
             Annotated[int, Limits(ge=0, le=1)],

@@ -29,7 +29,7 @@ import yaml
 from tests.packaging.installed import DEPENDENCIES, PYTHON, TREE, install_into
 from tests.packaging.machine import TOOLS, obstacle
 from tests.support.waiting import until
-from vram_arbiter.clients.cli.doctor.cgroup import UNIT_SCORE
+from vram_arbiter.clients.cli.doctor.health import UNIT_SCORE
 from vram_arbiter.schemas.runtime.trust import SERVICE_USERS
 
 FOLDER = TREE / "configs" / "containers"

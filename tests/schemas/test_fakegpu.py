@@ -183,24 +183,16 @@ def test_a_stowaway_is_a_file_that_anybody_may_write():
 def test_a_gpu_survives_the_daemon_but_not_the_boot():
     existing = fakegpu.dump_config(CONFIG)
     same = CONFIG.model_copy(update={"uuid": "other"})
-    assert fakegpu.plan_folder(same, existing, ["100-1.json"]) == fakegpu.FolderPlan()
-    rebooted = fakegpu.plan_folder(
-        same.model_copy(update={"boot_id": "next"}), existing, ["100-1.json"]
-    )
-    assert rebooted.remove == ("100-1.json",)
-    assert rebooted.fresh_log
-    assert fakegpu.parse_config(rebooted.write["gpu.json"]).uuid == CONFIG.uuid, (
-        "a GPU keeps its name"
-    )
+    assert fakegpu.new_gpu(same, existing, in_use=True) is None
+    rebooted = same.model_copy(update={"boot_id": "next"})
+    made = fakegpu.new_gpu(rebooted, existing, in_use=True)
+    assert made is not None
+    assert (made.boot_id, made.uuid) == ("next", CONFIG.uuid), "a GPU keeps its name"
     larger = CONFIG.model_copy(update={"capacity_bytes": 16 * GB})
     with pytest.raises(ConfigError, match="is in use here"):
-        fakegpu.plan_folder(larger, existing, ["100-1.json"])
-    assert (
-        fakegpu.parse_config(
-            fakegpu.plan_folder(larger, existing, []).write["gpu.json"]
-        ).capacity_bytes
-        == 16 * GB
-    )
+        fakegpu.new_gpu(larger, existing, in_use=True)
+    assert fakegpu.new_gpu(larger, existing, in_use=False) == larger
+    assert fakegpu.new_gpu(larger, None, in_use=True) == larger
 
 
 @pytest.mark.parametrize("kill_at", range(8))

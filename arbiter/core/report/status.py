@@ -3,7 +3,7 @@
 Typed data without words. Reads only. `view` is made for every reply about a lease.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from heapq import merge, nsmallest
@@ -149,20 +149,15 @@ def status(
     reader: ProcessKey | None = None,
     after: PageKey | None = None,
     limit: int | None = None,
-    only: Iterable[LeaseId] | None = None,
 ) -> StatusReply:
-    """Return the status with the leases that follow `after`, at most `limit` of them; with those of
-    `only` that are not over, if that is given.
+    """Return the status with the leases that follow `after`, at most `limit` of them.
 
     A page costs what it holds, however many wait: the queues are sorted already. Tokens are shown
     to `reader`, the process that holds the lease, and to an operator (None): a token is all that is
     needed to mark a use, which keeps a lease from being evicted.
     """
-    if only is None:
-        leases = list(islice(_listed(core.leases, core.gpus, after or FIRST_PAGE, limit), limit))
-    else:
-        leases = [core.leases[one] for one in only if one in core.leases]
-    more = only is None and leases and len(leases) == limit
+    leases = list(islice(_listed(core.leases, core.gpus, after or FIRST_PAGE, limit), limit))
+    more = leases and len(leases) == limit
     return StatusReply(
         epoch=core.settings.epoch,
         phase="serving" if core.serving else "recovering",

@@ -148,10 +148,8 @@ def make_gpu(
         if existing is not None and fakegpu.parse_config(existing).boot_id == boot_id:
             settled(folder)  # so that processes which died since do not count as using it
         names = [name for name in os.listdir(folder) if fakegpu.is_process_file(name)]
-        plan = fakegpu.plan_folder(wanted, existing, names)
-        for name in plan.remove:
-            (folder / name).unlink()
-        if plan.fresh_log:
-            (folder / fakegpu.LOG_FILE).unlink(missing_ok=True)
-        for name, text in plan.write.items():
-            replace(folder / name, text)
+        config = fakegpu.new_gpu(wanted, existing, in_use=bool(names))
+        if config is not None:
+            for name in (*names, fakegpu.LOG_FILE):
+                (folder / name).unlink(missing_ok=True)
+            replace(path, fakegpu.dump_config(config))

@@ -94,8 +94,8 @@ class NvmlProbe:
         for gpu, handle in self._handles.items():
             index = int(self._ask(gpu, self._nvml.nvmlDeviceGetIndex))
             name = _text(self._ask(gpu, self._nvml.nvmlDeviceGetName))
-            _, total, reserved = self._memory(gpu, handle)
-            found.append(GpuDevice(gpu, index, name, total, reserved))
+            _, total = self._memory(gpu, handle)
+            found.append(GpuDevice(gpu, index, name, total))
         return tuple(sorted(found, key=lambda device: device.index))
 
     def sample(self, gpu: GpuId) -> Reading:
@@ -104,7 +104,7 @@ class NvmlProbe:
         self._reopen_if_dead()
         handle = self._handles[gpu]
         try:
-            used, total, _ = self._memory(gpu, handle)
+            used, total = self._memory(gpu, handle)
         except ProbeFailed:
             self._failing.add(gpu)
             raise
@@ -146,8 +146,8 @@ class NvmlProbe:
         except self._nvml.NVMLError:
             pass  # it was shut down already: nothing is held
 
-    def _memory(self, gpu: GpuId, handle: Any) -> tuple[int, int, int]:
-        """(used, total, reserved) in bytes. What the driver reserves for itself counts neither as
+    def _memory(self, gpu: GpuId, handle: Any) -> tuple[int, int]:
+        """(used, total) in bytes. What the driver reserves for itself counts neither as
         used nor as there."""
         nvml = self._nvml
         try:
@@ -156,12 +156,12 @@ class NvmlProbe:
             except (nvml.NVMLError_NotSupported, nvml.NVMLError_FunctionNotFound):
                 # driver < 510: `used` includes the reserve, and it cannot be told apart
                 info = nvml.nvmlDeviceGetMemoryInfo(handle)
-                return int(info.used), int(info.total), 0
+                return int(info.used), int(info.total)
         except nvml.NVMLError as error:
             raise ProbeFailed(
                 f"memory of {gpu} cannot be read: {error}", hint="see nvidia-smi and dmesg"
             ) from error
-        return int(info.used), int(info.total) - int(info.reserved), int(info.reserved)
+        return int(info.used), int(info.total) - int(info.reserved)
 
     def _processes(self, handle: Any) -> tuple[ProcessUse, ...] | None:
         """Compute and graphics processes; None where the driver does not list them. A process in

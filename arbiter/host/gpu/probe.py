@@ -29,7 +29,7 @@ from vram_arbiter.schemas.ids import GpuId
 
 @dataclass(frozen=True, slots=True)
 class GpuDevice:
-    """One GPU as its backend names it. `reserved_bytes` the driver keeps for itself.
+    """One GPU as its backend names it; `total_bytes` without what the driver keeps for itself.
 
     A GPU that shares the machine's memory needs more: `margin_bytes` is its least reserve,
     `noise_bytes` its least tolerance.
@@ -39,7 +39,6 @@ class GpuDevice:
     index: int
     name: str
     total_bytes: int
-    reserved_bytes: int = 0
     margin_bytes: int = 0
     noise_bytes: int = 0
 

@@ -9,11 +9,9 @@ from typing import Final
 from vram_arbiter.clients.cli import arguments, terminal
 from vram_arbiter.clients.cli.doctor import (
     access,
-    cgroup,
     driver,
     health,
     installation,
-    leftovers,
 )
 from vram_arbiter.clients.cli.doctor.findings import WRONG, Checks, Report, Severity, examine
 from vram_arbiter.clients.cli.doctor.machine import Machine, ask_nvml, this_machine
@@ -23,10 +21,9 @@ from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 from vram_arbiter.schemas.runtime.printable import printable
 
 DESCRIPTIONS = {
-    "doctor": "Examine driver, socket, permissions, cgroups, suspend, "
-    "leftovers, a second arbiter, units, and what the arbiter says of itself and its GPUs. Each "
-    "finding names a command that resolves it; nothing is changed. Exits 0 without a warning or "
-    "error, 1 with one, 3 if the arbiter cannot be reached."
+    "doctor": "Examine driver, suspend, socket, permissions, versions, units, and what the arbiter "
+    "says of itself and its GPUs. Each finding names a command that resolves it; nothing is "
+    "changed. Exits 0 without a warning or error, 1 with one, 3 if the arbiter cannot be reached."
 }
 
 CHECKS: Final[Checks[Machine]] = (
@@ -40,10 +37,7 @@ CHECKS: Final[Checks[Machine]] = (
     ("daemon", health.daemon, ""),
     ("probe", health.probe, ""),
     ("stowaways", health.stowaways, "every GPU process has a lease"),
-    ("orphans", leftovers.sockets, "every socket beside the arbiter's is served"),
-    ("cgroup", cgroup.memory, "no memory limit affects the daemon"),
-    ("oom", cgroup.out_of_memory, "the daemon is not the first to be killed"),
-    ("ports", leftovers.arbiters, "no second arbiter of real GPUs"),
+    ("oom", health.out_of_memory, "the daemon is not the first to be killed"),
     ("units", installation.units, "the unit is enabled, and its program exists"),
 )
 """First part of the findings' codes, check, and what is said where it finds nothing; in the order

@@ -1,6 +1,8 @@
-"""Checks of what the arbiter says: its files, grants, GPUs, processes without a lease."""
+"""Checks of what the arbiter says: its files, grants, GPUs, processes without a lease; and of what
+the kernel may do to the daemon when memory runs out."""
 
 from collections.abc import Iterator
+from typing import Final
 
 from vram_arbiter.clients.cli.doctor.findings import (
     CouldNotLook,
@@ -13,6 +15,9 @@ from vram_arbiter.clients.cli.doctor.findings import (
 from vram_arbiter.clients.cli.doctor.machine import Machine
 from vram_arbiter.schemas.sizes import format_bytes
 from vram_arbiter.schemas.wire.replies import StatusReply
+
+UNIT_SCORE: Final = -500
+"""OOMScoreAdjust= of the unit."""
 
 
 def status_of(m: Machine) -> StatusReply:
@@ -68,4 +73,16 @@ def stowaways(m: Machine) -> Iterator[Finding]:
             "stowaways.process",
             f"pid {one.pid} {one.name} holds {size} without a lease",
             f"kill {one.pid}; vramctl run --vram {vram} -- {again}",
+        )
+
+
+def out_of_memory(m: Machine) -> Iterator[Finding]:
+    """The daemon is not the first to be killed."""
+    score = int(m.daemon_file("oom_score_adj"))
+    if score > 0 or (score > UNIT_SCORE and m.is_system):
+        yield warning(
+            "oom.score",
+            f"oom_score_adj of the daemon is {score}: when host memory runs out it ends before "
+            "programs that it knows",
+            f"echo {UNIT_SCORE} | {m.sudo}tee /proc/{m.arbiter.pid}/oom_score_adj",
         )

@@ -9,7 +9,7 @@ import grp
 import os
 import pwd
 import socket
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -106,10 +106,6 @@ class Machine:
         return self.uid == 0 or (found.st_mode >> shift) & needed == needed
 
     # -- processes
-    def pids(self) -> Iterator[int]:
-        """Yield the pids of the processes that can be seen."""
-        yield from (int(name) for name in self.names("/proc") if name.isdecimal())
-
     def command_line(self, pid: int) -> list[str]:
         """Return the arguments of a process; none of one that ended."""
         with contextlib.suppress(CouldNotLook):

@@ -1,4 +1,4 @@
-"""Live events of the open pages: a snapshot for each new page, then what changed, to all of them.
+"""Live events of the open pages: the status as it is now, and what has happened since the last.
 
 The program calls `publish` with each status that it reads: soon after an event, and every second
 while a page is open, so that each page knows that the daemon lives. When the arbiter is lost the
@@ -9,20 +9,19 @@ import asyncio
 import json
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from heapq import nsmallest
 from typing import Protocol
 
-from vram_arbiter.clients.observer.page.messages import Change, WaitsMessage
+from vram_arbiter.clients.observer.page.messages import WaitsMessage
 from vram_arbiter.clients.observer.page.usage import UsageRecord
 from vram_arbiter.clients.observer.present import ASK_S, Look
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.errors import VramError
-from vram_arbiter.schemas.plain import JsonMap, JsonObject
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.explained import Explanation, WhyReply
 from vram_arbiter.schemas.wire.notes import DAEMON_KINDS, NOTES
 from vram_arbiter.schemas.wire.replies import HistoryReply, StatusReply
-from vram_arbiter.schemas.wire.views import LeaseView
 
 FEW_LEASES = 100
 """In one message."""
@@ -36,9 +35,6 @@ UNREAD_MAX_BYTES = 2 * 1024 * 1024
 """Of events that a page has not taken: one that is slower is dropped, and connects again."""
 USE_KINDS = ("use_began", "use_ended")
 _TOLD_KINDS = tuple(kind for kind in (*NOTES, *DAEMON_KINDS) if kind not in USE_KINDS)
-
-_RUNNING = ("since_s", "waited_s", "granted_s", "ttl_left_s")
-"""Fields of a lease that change with time alone: the page counts on by itself."""
 
 
 class PageSource(Protocol):
@@ -89,15 +85,6 @@ class PageReader:
             self._left(self)
 
 
-@dataclass(frozen=True, slots=True)
-class _Difference:
-    """Leases that the pages have otherwise."""
-
-    leases: Sequence[LeaseView]
-    moved: dict[str, int]
-    gone: tuple[str, ...]
-
-
 class PageFeed:
     """`join` of pages; `happened` with new events, then `publish` with a status."""
 
@@ -108,9 +95,7 @@ class PageFeed:
         self._asked = asked
         self._readers: dict[PageReader, None] = {}
         self._events: deque[JsonMap] = deque(maxlen=EVENTS_MAX)  # since the last message
-        # what the pages have
-        self._rows: dict[str, JsonObject] = {}
-        self._usage_number = 0
+        self._usage_number = 0  # of the usage that the pages have
         self._epoch: int | None = None
 
     def join(self, abort: Callable[[], None]) -> PageReader:
@@ -135,8 +120,8 @@ class PageFeed:
         self._readers.clear()
 
     async def publish(self, look: Look) -> None:
-        """Send a snapshot to new pages, to others what changed. Where the arbiter does not answer
-        in time all pages begin anew, as they missed something."""
+        """Send the status to all pages, with the past to new ones. Where the arbiter does not
+        answer in time all pages begin anew, as they missed something."""
         try:
             async with asyncio.timeout(ASK_S):
                 await self._publish(look)
@@ -157,35 +142,18 @@ class PageFeed:
             reader.told = True
         events = list(self._events)
         self._events.clear()
-        change = self._difference(look.status.leases)
         waits = _event("waits", WaitsMessage(await self._waits(look.status)))
+        now = [*_pages(look.status), waits]
         number, self._usage_number = self._usage_number, self._record.number
         if joining:  # what comes meanwhile it gets twice, and drops by its number
-            snapshot = [*_pages(look.status), waits, *await self._past(look)]
-            self._tell(joining, b"".join(snapshot))
-        parts = [*_changes(look.status, change), waits]
+            self._tell(joining, b"".join([*now, *await self._past(look)]))
+        parts = list(now)
         if number != self._usage_number:
             parts.append(_event("usage", self._record.since(number, look.origin)))
         if events:
             reply = HistoryReply(tuple(events), events[-1]["seq"])
             parts.append(_event("history", reply))
         self._tell(others, b"".join(parts))
-
-    def _difference(self, leases: Sequence[LeaseView]) -> _Difference:
-        """Compare the leases with what the pages have."""
-        rows, moved, changed = dict[str, JsonObject](), dict[str, int](), list[LeaseView]()
-        for lease in leases:
-            row = rows[lease.lease_id] = _steady(lease)
-            old, position = self._rows.get(lease.lease_id), lease.position
-            if old == row:
-                continue
-            if old and position is not None and {**old, "position": position} == row:
-                moved[lease.lease_id] = position
-            else:
-                changed.append(lease)
-        gone = tuple(self._rows.keys() - rows.keys())
-        self._rows = rows
-        return _Difference(changed, moved, gone)
 
     async def _waits(self, status: StatusReply) -> tuple[Explanation, ...]:
         """Explain the first requests."""
@@ -213,31 +181,12 @@ class PageFeed:
 
 
 def _pages(status: StatusReply) -> list[bytes]:
-    """Return a whole status for new pages, some leases a message."""
+    """Return a whole status, some leases a message."""
     found = []
     for start in range(0, max(1, len(status.leases)), FEW_LEASES):
         some = replace(status, leases=status.leases[start : start + FEW_LEASES], daemon=None)
         found.append(_event("page" if start else "snapshot", some))
     return found
-
-
-def _changes(status: StatusReply, change: _Difference) -> list[bytes]:
-    """Return what changed, some leases a message."""
-    found = []
-    for start in range(0, max(1, len(change.leases)), FEW_LEASES):
-        some = tuple(change.leases[start : start + FEW_LEASES])
-        shown = replace(status, leases=some, daemon=None)
-        told = Change(shown) if start else Change(shown, change.gone, change.moved)
-        found.append(_event("change", told))
-    return found
-
-
-def _steady(lease: LeaseView) -> JsonObject:
-    """Return what a page knows of a lease, but for what changes with time alone."""
-    row = to_map(lease)
-    for name in _RUNNING:
-        row.pop(name, None)
-    return row
 
 
 def _event(name: str, message: object) -> bytes:

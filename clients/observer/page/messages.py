@@ -1,24 +1,13 @@
 """What the page is sent as server-sent events, beside the wire's own replies.
 
-The events by name: `snapshot` and `page` (a `StatusReply`, whose leases come in pages), `change`,
-`waits`, `usage`, `history` (a `HistoryReply`). All are written by `schemas.codec`.
+The events by name: `snapshot` and `page` (a `StatusReply`, whose leases come in pages), `waits`,
+`usage`, `history` (a `HistoryReply`). All are written by `schemas.codec`.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from vram_arbiter.schemas.wire.explained import Explanation
-from vram_arbiter.schemas.wire.replies import StatusReply
-
-
-@dataclass(frozen=True, slots=True)
-class Change:
-    """What changed since the last message. `status` has the leases that changed, all else whole."""
-
-    status: StatusReply
-    gone: tuple[str, ...] = ()  # ids of leases
-    moved: Mapping[str, int] | None = None  # waiters of which the position alone changed
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,8 @@ import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from vram_arbiter.clients.observer.page.owner import Owners
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.trust import port_uids
 from vram_arbiter.schemas.urls import HttpAddress
 
 CONNECTIONS_MAX = 48
@@ -51,7 +51,7 @@ class Connections:
     """Open connections, oldest first."""
 
     def __init__(self, *, loopback: bool) -> None:
-        self._owners = Owners() if loopback else None
+        self._loopback = loopback
         self._open: dict[End, _Open] = {}
 
     def opened(self, end: End, transport: asyncio.Transport) -> None:
@@ -86,9 +86,12 @@ class Connections:
             one.transport.abort()
 
     def _peer_of(self, end: End, transport: asyncio.Transport) -> Peer:
-        if self._owners is not None:
-            uid = self._owners.uid(transport.get_extra_info("socket"))
-            return ("", -1 if uid is None else uid)
+        if self._loopback:
+            try:
+                uids = port_uids(transport.get_extra_info("socket"))
+            except OSError:  # its other end has gone
+                uids = set()
+            return ("", min(uids, default=-1))
         address = ipaddress.ip_address(end[0].partition("%")[0])
         if address.version == 6:  # one subscriber line has a whole /64
             return (str(ipaddress.ip_network((int(address) >> 64 << 64, 64))), 0)

@@ -6,7 +6,7 @@ processes are gone nothing of them is left.
 import os
 import random
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
+from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,7 +29,7 @@ from vram_arbiter.arbiter.rpc.registry import SessionSettings
 from vram_arbiter.arbiter.rpc.session import SessionTable
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.codec import to_map
-from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey
 from vram_arbiter.schemas.runtime.peercred import Peer
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import HistoryReply, StatusReply
@@ -55,9 +55,6 @@ class Recording:
         answer()
 
     def status(self, *page: object, details: bool = False) -> StatusReply:
-        return IDLE_STATUS
-
-    def leases(self, ids: Iterable[LeaseId]) -> StatusReply:
         return IDLE_STATUS
 
     def why(self, consumer: str) -> WhyReply:
@@ -118,9 +115,6 @@ class RealCore:
         details: bool = False,
     ) -> StatusReply:
         return self.arbiter.status(self.plant.now, reader, after, d.STATUS_PAGE, details=details)
-
-    def leases(self, ids: Iterable[LeaseId]) -> StatusReply:
-        return self.arbiter.leases(ids, self.plant.now)
 
     def why(self, consumer: str) -> WhyReply:
         return self.arbiter.why(consumer, self.plant.now)

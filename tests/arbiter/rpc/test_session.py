@@ -2,7 +2,7 @@
 list."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -69,9 +69,6 @@ class Bench:
         details: bool = False,
     ) -> StatusReply:
         self.asked_status = (reader, after)
-        return IDLE_STATUS
-
-    def leases(self, ids: Iterable[LeaseId]) -> StatusReply:
         return IDLE_STATUS
 
     def why(self, consumer: str) -> WhyReply:

@@ -23,7 +23,6 @@ PID, UID, OTHER = 700, 4242, 4243
 SOCKET = "/run/vram-arbiter/arbiter.sock"
 UNIT = "[Service]\nExecStart=/opt/vram-arbiter/bin/vram-arbiter --group vram-arbiter\n"
 UNIX = "Num RefCount Protocol Flags Type St Inode Path\n"
-GROUP = "/sys/fs/cgroup/system.slice/vram-arbiter.service"
 SOUND: Mapping[str, str] = {
     "/proc/driver/nvidia/version": "NVRM version: NVIDIA UNIX x86_64  580.95.05  Tue Sep 23\n",
     "/proc/driver/nvidia/params": "PreserveVideoMemoryAllocations: 1\n",
@@ -34,11 +33,7 @@ SOUND: Mapping[str, str] = {
     "/run/systemd/system/x": "",
     SOCKET: "",
     "/proc/net/unix": f"{UNIX}0: 00000002 00000000 00010000 0001 01 55 {SOCKET}\n",
-    f"/proc/{PID}/cmdline": "/opt/python3\0/opt/vram-arbiter/bin/vram-arbiter\0",
-    f"/proc/{PID}/cgroup": "0::/system.slice/vram-arbiter.service\n",
     f"/proc/{PID}/oom_score_adj": "-500\n",
-    "/sys/fs/cgroup/cgroup.controllers": "cpu memory\n",
-    f"{GROUP}/memory.max": "max\n",
     "/opt/vram-arbiter/bin/vram-arbiter": "",
     "/etc/systemd/system/vram-arbiter.service": UNIT,
     "/etc/systemd/system/multi-user.target.wants/vram-arbiter.service": "",
@@ -146,7 +141,6 @@ def masked(m: Machine) -> Machine:
     return m
 
 
-SECOND = {"/proc/800/cmdline": "/home/x/bin/python\0-m\0vram_arbiter.arbiter\0"}
 USER_UNIT = {
     "/home/op/.config/systemd/user/vram-arbiter.service": UNIT,
     "/home/op/.config/systemd/user/default.target.wants/vram-arbiter.service": "",
@@ -246,19 +240,7 @@ CASES = [
         {"/proc/77/cmdline": "python\0train.py\0"},
         gpu(processes=(STOWAWAY,)),
     ),
-    Case("orphans.socket", "rm /run/vram-arbiter/grab.sock", {"/run/vram-arbiter/grab.sock": ""}),
-    Case(
-        "cgroup.limit",
-        "set-property vram-arbiter.service MemoryMax=infinity",
-        {f"{GROUP}/memory.max": "67108864\n"},
-    ),
-    Case(
-        "cgroup.limit",
-        "set-property system.slice MemoryHigh=infinity",
-        {"/sys/fs/cgroup/system.slice/memory.high": "1048576\n"},
-    ),
     Case("oom.score", f"tee /proc/{PID}/oom_score_adj", {f"/proc/{PID}/oom_score_adj": "0\n"}),
-    Case("ports.arbiters", "kill 800", SECOND),
     Case(
         "units.missing",
         "vramctl install",

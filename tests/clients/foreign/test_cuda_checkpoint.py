@@ -9,12 +9,7 @@ from typing import Any
 
 import pytest
 
-from vram_arbiter.clients.foreign.cuda_checkpoint import (
-    CheckpointAction,
-    CheckpointDriver,
-    CudaDriver,
-    State,
-)
+from vram_arbiter.clients.foreign.cuda_checkpoint import CheckpointAction, CudaDriver, State
 from vram_arbiter.schemas.errors import ActionFailed, CheckpointUnsupported
 
 LIMIT_S = 30.0
@@ -30,8 +25,6 @@ class SimulatedDriver:
         self.states = {int(name[1:]): state for name, state in states.items()}
         self.failing: dict[tuple[str, int], State] = {}
         self.did: list[tuple[str, int]] = []
-
-    def check(self) -> None: ...
 
     def state(self, pid: int) -> State:
         return self.states.get(pid, State.NONE)
@@ -57,80 +50,6 @@ class SimulatedDriver:
         if self.states[pid] is not before:
             raise ActionFailed(f"{what} of pid {pid}: it is {self.states[pid].value}")
         self.states[pid] = after
-
-
-def suspended(driver: CheckpointDriver) -> CheckpointAction:
-    return CheckpointAction(driver, LIMIT_S)
-
-
-def test_all_cuda_processes_are_suspended_and_resumed() -> None:
-    """The shell that started them is none. All are locked before one is checkpointed, so that no
-    process goes on with a peer that is away."""
-    driver = SimulatedDriver(p2=State.RUNNING, p3=State.RUNNING)
-    action = suspended(driver)
-    action.free([1, 2, 3])
-    assert driver.did == [("lock", 2), ("lock", 3), ("checkpoint", 2), ("checkpoint", 3)]
-    driver.did.clear()
-    action.restore([1, 2, 3])
-    assert driver.did == [("restore", 2), ("unlock", 2), ("restore", 3), ("unlock", 3)]
-    assert set(driver.states.values()) == {State.RUNNING}
-
-
-@pytest.mark.parametrize("step", ["lock", "checkpoint"])
-def test_a_process_that_cannot_be_suspended_leaves_none_suspended(step: str) -> None:
-    driver = SimulatedDriver(p2=State.RUNNING, p3=State.RUNNING)
-    driver.failing[step, 3] = State.RUNNING if step == "lock" else State.LOCKED
-    with pytest.raises(ActionFailed, match=f"{step} of pid 3 failed; the program continues"):
-        suspended(driver).free([2, 3])
-    assert driver.states == {2: State.RUNNING, 3: State.RUNNING}
-
-
-def test_a_broken_process_is_named() -> None:
-    """The driver may leave a process broken whose checkpoint fails, with unified memory say."""
-    driver = SimulatedDriver(p2=State.RUNNING, p3=State.RUNNING)
-    driver.failing["checkpoint", 2] = State.FAILED
-    with pytest.raises(ActionFailed, match="the CUDA state of pid 2 is broken"):
-        suspended(driver).free([2, 3])
-    assert driver.states == {2: State.FAILED, 3: State.RUNNING}
-
-
-def test_a_restore_that_fails_is_told_and_the_others_return() -> None:
-    driver = SimulatedDriver(p2=State.RUNNING, p3=State.RUNNING)
-    action = suspended(driver)
-    action.free([2, 3])
-    driver.failing["restore", 2] = State.CHECKPOINTED
-    with pytest.raises(ActionFailed, match=r"restore of pid 2 failed \(the program stays"):
-        action.restore([2, 3])
-    assert driver.states == {2: State.CHECKPOINTED, 3: State.RUNNING}
-
-
-# -- requirements
-def proc(folder: Path, scope: int, capabilities: int) -> Path:
-    (folder / "sys/kernel/yama").mkdir(parents=True)
-    (folder / "sys/kernel/yama/ptrace_scope").write_text(f"{scope}\n")
-    (folder / "self").mkdir()
-    (folder / "self/status").write_text(f"Name:\tx\nCapEff:\t{capabilities:016x}\n")
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("scope", "capabilities", "allowed"),
-    [(0, 0, True), (1, 0, True), (2, 0, False), (2, 1 << 19, True), (3, 1 << 19, False)],
-)
-def test_privileges(scope: int, capabilities: int, allowed: bool, tmp_path: Path) -> None:
-    action = CheckpointAction(
-        SimulatedDriver(), LIMIT_S, "x86_64", proc(tmp_path, scope, capabilities)
-    )
-    if allowed:
-        action.check()
-    else:
-        with pytest.raises(CheckpointUnsupported, match=f"ptrace_scope is {scope}"):
-            action.check()
-
-
-def test_other_architectures_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointUnsupported, match="needs x86_64, this machine is aarch64"):
-        CheckpointAction(SimulatedDriver(), LIMIT_S, "aarch64", tmp_path).check()
 
 
 class Api(SimpleNamespace):
@@ -168,13 +87,93 @@ class Api(SimpleNamespace):
         return (self.CUresult.CUDA_SUCCESS,)
 
 
+def over(states: SimulatedDriver, version: int = 12080) -> CudaDriver:
+    return CudaDriver(Api(version, states))
+
+
+def suspended(states: SimulatedDriver) -> CheckpointAction:
+    return CheckpointAction(over(states), LIMIT_S)
+
+
+def test_all_cuda_processes_are_suspended_and_resumed() -> None:
+    """The shell that started them is none. All are locked before one is checkpointed, so that no
+    process goes on with a peer that is away."""
+    driver = SimulatedDriver(p2=State.RUNNING, p3=State.RUNNING)
+    action = suspended(driver)
+    action.free([1, 2, 3])
+    assert driver.did == [("lock", 2), ("lock", 3), ("checkpoint", 2), ("checkpoint", 3)]
+    driver.did.clear()
+    action.restore([1, 2, 3])
+    assert driver.did == [("restore", 2), ("unlock", 2), ("restore", 3), ("unlock", 3)]
+    assert set(driver.states.values()) == {State.RUNNING}
+
+
+@pytest.mark.parametrize("step", ["lock", "checkpoint"])
+def test_a_process_that_cannot_be_suspended_leaves_none_suspended(step: str) -> None:
+    driver = SimulatedDriver(p2=State.RUNNING, p3=State.RUNNING)
+    driver.failing[step, 3] = State.RUNNING if step == "lock" else State.LOCKED
+    with pytest.raises(
+        ActionFailed, match=f"{step} of pid 3: CUDA_ERROR_NOT_PERMITTED; the program"
+    ):
+        suspended(driver).free([2, 3])
+    assert driver.states == {2: State.RUNNING, 3: State.RUNNING}
+
+
+def test_a_broken_process_is_named() -> None:
+    """The driver may leave a process broken whose checkpoint fails, with unified memory say."""
+    driver = SimulatedDriver(p2=State.RUNNING, p3=State.RUNNING)
+    driver.failing["checkpoint", 2] = State.FAILED
+    with pytest.raises(ActionFailed, match="the CUDA state of pid 2 is broken"):
+        suspended(driver).free([2, 3])
+    assert driver.states == {2: State.FAILED, 3: State.RUNNING}
+
+
+def test_a_restore_that_fails_is_told_and_the_others_return() -> None:
+    driver = SimulatedDriver(p2=State.RUNNING, p3=State.RUNNING)
+    action = suspended(driver)
+    action.free([2, 3])
+    driver.failing["restore", 2] = State.CHECKPOINTED
+    with pytest.raises(
+        ActionFailed, match=r"restore of pid 2: CUDA_ERROR_NOT_PERMITTED \(the program"
+    ):
+        action.restore([2, 3])
+    assert driver.states == {2: State.CHECKPOINTED, 3: State.RUNNING}
+
+
+# -- requirements
+def proc(folder: Path, scope: int, capabilities: int) -> Path:
+    (folder / "sys/kernel/yama").mkdir(parents=True)
+    (folder / "sys/kernel/yama/ptrace_scope").write_text(f"{scope}\n")
+    (folder / "self").mkdir()
+    (folder / "self/status").write_text(f"Name:\tx\nCapEff:\t{capabilities:016x}\n")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("scope", "capabilities", "allowed"),
+    [(0, 0, True), (1, 0, True), (2, 0, False), (2, 1 << 19, True), (3, 1 << 19, False)],
+)
+def test_privileges(scope: int, capabilities: int, allowed: bool, tmp_path: Path) -> None:
+    driver, folder = over(SimulatedDriver()), proc(tmp_path, scope, capabilities)
+    action = CheckpointAction(driver, LIMIT_S, "x86_64", folder)
+    if allowed:
+        action.check()
+    else:
+        with pytest.raises(CheckpointUnsupported, match=f"ptrace_scope is {scope}"):
+            action.check()
+
+
+def test_other_architectures_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointUnsupported, match="needs x86_64, this machine is aarch64"):
+        CheckpointAction(CudaDriver(), LIMIT_S, "aarch64", tmp_path).check()
+
+
 def test_the_drivers_calls() -> None:
     """Arguments and answers as `cuda.bindings` has them."""
     states = SimulatedDriver(p2=State.RUNNING)
-    driver = CudaDriver(Api(12080, states))
+    driver, action = over(states), suspended(states)
     driver.check()
     assert driver.state(1) is State.NONE
-    action = suspended(driver)
     action.free([1, 2])
     assert states.states[2] is driver.state(2) is State.CHECKPOINTED
     action.restore([1, 2])
@@ -186,7 +185,7 @@ def test_the_drivers_calls() -> None:
 
 def test_a_driver_that_is_too_old() -> None:
     with pytest.raises(CheckpointUnsupported, match=r"driver 570.*CUDA 12\.4"):
-        CudaDriver(Api(12040, SimulatedDriver())).check()
+        over(SimulatedDriver(), 12040).check()
 
 
 # -- a real driver

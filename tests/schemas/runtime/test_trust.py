@@ -74,6 +74,23 @@ def test_the_kernel_names_the_user_behind_a_port(address: str) -> None:
         assert port_uids(client) == set(), "there is none any more"
 
 
+@pytest.mark.parametrize("address", ["127.0.0.1", "127.0.0.2", "::1"])
+def test_a_server_learns_which_user_has_connected(address: str) -> None:
+    """The status page divides its connections by users."""
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    if ":" in address and not socket.has_dualstack_ipv6():
+        pytest.skip("no IPv6 here")
+    with (
+        socket.create_server((address, 0), family=family) as server,
+        socket.create_connection(server.getsockname()[:2]) as client,
+    ):
+        accepted, _ = server.accept()
+        with accepted:
+            assert port_uids(accepted) == {os.geteuid()}
+            client.close()
+            assert port_uids(accepted) == set(), "there is none any more"
+
+
 @as_root
 def test_every_user_who_listens_on_the_port_counts() -> None:
     """The kernel names no owner of a connection that waits to be accepted: it read as root's."""

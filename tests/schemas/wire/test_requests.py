@@ -94,7 +94,8 @@ def test_what_older_clients_leave_out_is_its_default(
     assert read == from_map(type(request_), short)
 
 
-def test_a_list_of_leases_ends_at_its_first_wrong_item() -> None:
-    """Regression: a status with a page of wrong ids cost the daemon an error for each."""
-    with pytest.raises(Exception, match=r"leases\.0: Input should be a valid string$"):
-        decode(msgpack.packb({"op": "status", "id": 1, "leases": [0] * 100}), MESSAGE_MAX_BYTES)
+@pytest.mark.parametrize("op", ["renew", "reattach"])
+def test_a_list_of_leases_ends_at_its_first_wrong_item(op: str) -> None:
+    """Regression: a page of wrong ids cost the daemon an error for each."""
+    with pytest.raises(Exception, match=r"leases\.0: Input should be [a-zA-Z ]+$"):
+        decode(msgpack.packb({"op": op, "id": 1, "leases": [0] * 100}), MESSAGE_MAX_BYTES)

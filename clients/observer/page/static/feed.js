@@ -50,7 +50,6 @@ export class Feed {
       });
     on("snapshot", this.snapshot);
     on("page", (page) => this.add(page.leases));
-    on("change", this.change);
     on("waits", (told) => {
       this.waits = new Map(
         told.waits.map((one) => [one.lease_id, { ...one, at: performance.now() }]),
@@ -115,12 +114,10 @@ export class Feed {
     } else if (!this.source) this.connect();
   }
 
-  snapshot(page) {
-    Object.assign(this, { leases: new Map(), samples: new Map(), waits: new Map() });
-    this.take(page);
-  }
-
-  take(status) {
+  snapshot(status) {
+    this.leases = new Map();
+    // times of another start of the daemon
+    if (status.epoch !== this.status?.epoch) this.samples = new Map();
     this.status = status;
     this.receivedAt = performance.now();
     this.add(status.leases);
@@ -135,15 +132,6 @@ export class Feed {
         askedAt: now - 1000 * (lease.waited_s ?? 0),
       });
     }
-  }
-
-  change(told) {
-    for (const id of told.gone ?? []) this.leases.delete(id);
-    for (const [id, position] of Object.entries(told.moved ?? {})) {
-      const lease = this.leases.get(id);
-      if (lease) lease.position = position;
-    }
-    this.take(told.status);
   }
 
   usage(told) {

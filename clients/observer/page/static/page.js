@@ -24,7 +24,6 @@ const NEEDS = {
   link: ["link"],
   snapshot: ["link", "gpus", "leases", "queue"],
   page: ["leases", "queue"],
-  change: ["link", "gpus", "leases", "queue"],
   waits: ["queue"],
   usage: ["gpus"],
   history: ["history"],

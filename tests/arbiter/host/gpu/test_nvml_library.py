@@ -19,7 +19,7 @@ READ = """
     gpus = probe.gpus()
     reading = probe.sample(gpus[0].id)
     print(json.dumps({
-        "gpus": [[c.id, c.index, c.name, c.total_bytes, c.reserved_bytes] for c in gpus],
+        "gpus": [[c.id, c.index, c.name, c.total_bytes] for c in gpus],
         "used": reading.used_bytes,
         "total": reading.total_bytes,
         "processes": reading.processes and [
@@ -93,8 +93,8 @@ def test_memory_v2_leaves_the_drivers_reserve_out(nvml: NvmlStub) -> None:
     nvml.write()
     said = answer_of_child(nvml, READ)
     assert said["gpus"] == [
-        ["GPU-stub-b", 0, "NVIDIA Stub", 8 * GIB - 256 * MIB, 256 * MIB],
-        ["GPU-stub-a", 1, "NVIDIA Stub", 24 * GIB - 512 * MIB, 512 * MIB],
+        ["GPU-stub-b", 0, "NVIDIA Stub", 8 * GIB - 256 * MIB],
+        ["GPU-stub-a", 1, "NVIDIA Stub", 24 * GIB - 512 * MIB],
     ]
     assert (said["used"], said["total"], said["processes"]) == (GIB, 8 * GIB - 256 * MIB, [])
 

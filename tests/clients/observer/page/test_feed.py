@@ -49,14 +49,10 @@ class Arbiter:
         return HistoryReply((), 0)
 
 
-def test_pages_are_told_what_changed_and_no_more(driver: CoreDriver) -> None:
-    """A lease that only grew older is not sent again; one that is gone is named; a waiter that only
-    moved up has its new place alone."""
+def test_every_page_is_told_the_status_and_a_new_one_the_past(driver: CoreDriver) -> None:
+    """A lease that is gone is not among the leases any more; the past is sent once."""
 
-    def look() -> Look:
-        return Look(driver.arbiter.status(driver.now), driver.now, 0.0)
-
-    async def story() -> list[Any]:
+    async def story() -> list[tuple[str, Any]]:
         asked: list[int] = []
         feed = PageFeed(Arbiter(driver), UsageRecord(), lambda: asked.append(1))
         det = driver.consumer("det")
@@ -67,11 +63,9 @@ def test_pages_are_told_what_changed_and_no_more(driver: CoreDriver) -> None:
         waiter = first.acquire(5 * GIB)
         second = driver.consumer("second").acquire(5 * GIB)
         reader = feed.join(lambda: None)
-        await feed.publish(look())
-        driver.advance(0.1)
-        await feed.publish(look())
+        await feed.publish(look_of(driver))
         first.cancel(waiter)
-        await feed.publish(look())
+        await feed.publish(look_of(driver))
         reader.end()
         told = []
         for chunk in list(reader._unread):
@@ -79,15 +73,13 @@ def test_pages_are_told_what_changed_and_no_more(driver: CoreDriver) -> None:
                 name, _, data = event.partition("\ndata: ")
                 told.append((name.removeprefix("event: "), strictjson.loads(data)))
         assert asked == [1]
-        changes = [data for name, data in told if name == "change"]
-        snapshot = next(data for name, data in told if name == "snapshot")
-        assert {one["lease_id"] for one in snapshot["leases"]} == {lease, waiter, second}
-        assert changes[0]["status"]["leases"] == []
-        assert changes[1]["gone"] == [waiter]
-        assert changes[1]["moved"] == {second: 1}
+        before, after = (data["leases"] for name, data in told if name == "snapshot")
+        assert {one["lease_id"] for one in before} == {lease, waiter, second}
+        assert {one["lease_id"]: one.get("position") for one in after} == {lease: None, second: 1}
         return told
 
-    assert [name for name, _ in asyncio.run(story())][:2] == ["snapshot", "waits"]
+    names = [name for name, _ in asyncio.run(story())]
+    assert names == ["snapshot", "waits", "usage", "history", "history", "snapshot", "waits"]
     assert replace(look_of(driver), at=1.0).origin == 1.0 - look_of(driver).status.uptime_s
 
 
@@ -101,7 +93,7 @@ class Silent(Arbiter):
 def test_pages_begin_anew_where_the_arbiter_is_too_slow(
     driver: CoreDriver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Events and changes that were taken for a message are in no later one."""
+    """Events that were taken for a message are in no later one."""
     monkeypatch.setattr(feed_module, "ASK_S", 0.05)
 
     async def story() -> list[bytes]:
