@@ -66,6 +66,7 @@ class Goal:
     """One accepted goal.
 
     `deadline_s` is resolved (seconds from acceptance); `max_ticks` counts ticks with the robot.
+    `from_here`: the operator gives it back, and it goes on where the robot is.
     """
 
     goal_id: str
@@ -76,6 +77,7 @@ class Goal:
     deadline_s: float = 0.0
     max_ticks: int | None = None
     traceparent: str | None = None
+    from_here: bool = False
 
 
 @dataclass(frozen=True, slots=True)

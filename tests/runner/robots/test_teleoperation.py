@@ -34,7 +34,7 @@ from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
 from vram_arbiter.runner.skills.teleop import ALIGN_RAD_S, MANIFEST, NAME
 from vram_arbiter.runner.skills.wiring import wire_up
 from vram_arbiter.schemas.config.robot import TeleopConfig, robot_of
-from vram_arbiter.schemas.errors import ConfigError, RobotFault
+from vram_arbiter.schemas.errors import BadState, ConfigError, RobotFault
 from vram_arbiter.schemas.manifest import Kind, parse_manifest
 from vram_arbiter.schemas.yamltext import parse_yaml
 
@@ -203,9 +203,10 @@ async def test_the_arm_goes_to_the_leader_without_a_jump_and_then_follows_it(ben
     bench.lead("shoulder_pan", -0.3)
     await bench.until_at("shoulder_pan", -0.3)
     assert ALIGN_RAD_S / RATE_HZ < bench.ticks.longest_step(aligned - 1) <= 4.7 / RATE_HZ
-    await goal.cancel()
-    assert (await goal.result(60))["status"] == "canceled"
-    assert all(tick.intervention for tick in bench.ticks.ticks)
+    await bench.client.take_over("end")
+    result = await goal.result(60)
+    assert (result["status"], result["data"]["ended_by"]) == ("succeeded", "operator")
+    assert all(tick.intervention for tick in bench.ticks.ticks[:-1])
 
 
 async def test_a_leader_that_is_unplugged_makes_the_arm_hold_and_then_fails_the_goal(
@@ -244,6 +245,69 @@ async def test_an_operator_who_pushes_against_a_limit_does_not_fail_the_goal(ben
     await bench.until_at("shoulder_pan", 0.1)
     await goal.cancel()
     assert (await goal.result(60))["data"]["withheld"] >= 30
+
+
+async def test_a_take_over_ends_the_policys_use_and_gives_back_to_a_fresh_one(
+    bench: Bench,
+) -> None:
+    goal = await bench.client.send_goal("test/grab", prompt="grab it")
+    while len(bench.sidecar.observations) < 2:
+        await asyncio.sleep(0.01)
+    assert (await bench.client.take_over("take"))["goal_id"] == goal.goal_id
+    assert [use.ended for use in bench.arbiter.uses] == [1]
+    asked = len(bench.sidecar.observations)
+    bench.lead("shoulder_pan", 0.3)
+    await bench.until_at("shoulder_pan", 0.3)
+    assert len(bench.sidecar.observations) == asked
+    with pytest.raises(BadState, match="already"):
+        await bench.client.take_over("take")
+    before = len(bench.sidecar.calls)
+    bench.sidecar.action = [[0.3, *bench.sidecar.action[0][1:]]] * 3
+    back = len(bench.ticks.ticks)
+    await bench.client.take_over("give_back")
+    await bench.until_phase("running")
+    while len(bench.sidecar.observations) == asked:
+        await asyncio.sleep(0.01)
+    assert bench.sidecar.calls[before : before + 3] == ["load", "reset", "get_action"]
+    fresh = bench.sidecar.observations[asked]["observation.state"]
+    assert fresh[0] == pytest.approx(0.3, abs=0.15)  # the servo lags; the start pose has 0
+    assert [use.ended for use in bench.arbiter.uses] == [1, 0]
+    assert bench.ticks.longest_step(back - 1) < 0.02  # it did not go to its start pose again
+    await goal.cancel()
+    assert (await goal.result(60))["status"] == "canceled"
+    assert [use.ended for use in bench.arbiter.uses] == [1, 1]
+    runs = [tick.intervention for tick in bench.ticks.ticks]
+    changes = sum(a != b for a, b in itertools.pairwise(runs))
+    assert (runs[0], runs[-1], changes) == (False, False, 2)
+
+
+async def test_a_policy_that_cannot_go_on_fails_the_goal(bench: Bench) -> None:
+    goal = await bench.client.send_goal("test/grab", prompt="grab it")
+    await bench.until_phase("running")
+    await bench.client.take_over("take")
+    bench.sidecar.load_error = RobotFault("out of order")
+    await bench.client.take_over("give_back")
+    result = await goal.result(60)
+    assert (result["status"], result["data"].get("ended_by")) == ("failed", None)
+    assert "out of order" in result["message"]
+
+
+async def test_a_dead_leader_takes_nothing_over(bench: Bench) -> None:
+    goal = await bench.client.send_goal("test/grab", prompt="grab it")
+    await bench.until_phase("running")
+    bench.bus.cut()
+    with pytest.raises(RobotFault, match="does not answer"):
+        await bench.client.take_over("take")
+    asked = len(bench.sidecar.observations)
+    while len(bench.sidecar.observations) < asked + 2:  # the policy goes on
+        await asyncio.sleep(0.01)
+    for do in ("give_back", "end"):
+        with pytest.raises(BadState, match="does not have the robot"):
+            await bench.client.take_over(do)  # type: ignore[arg-type]
+    await goal.cancel()
+    await goal.result(60)
+    with pytest.raises(BadState, match="does not move the robot"):
+        await bench.client.take_over("take")
 
 
 def test_keys_move_joints_while_they_are_pressed(monkeypatch: pytest.MonkeyPatch) -> None:
