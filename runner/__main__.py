@@ -23,10 +23,10 @@ from vram_arbiter.schemas.runtime.version import add_version
 
 COMMANDS = (
     "sim", "benchmark", "deploy", "estop", "goal", "state", "frame", "reset", "mark", "takeover",
-    "episodes", "replay", "ros2",
+    "record", "episodes", "replay", "ros2",
 )  # fmt: skip
 URGENT = "estop"
-CLIENTS = (URGENT, "goal", "state", "frame", "reset", "mark", "takeover")  # without a GPU
+CLIENTS = (URGENT, "goal", "state", "frame", "reset", "mark", "takeover", "record")  # without a GPU
 
 
 def parser(names: Sequence[str] = COMMANDS) -> argparse.ArgumentParser:

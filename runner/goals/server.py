@@ -292,6 +292,7 @@ class GoalServer:
             "estop": robot.estop.message if robot.estop is not None else None,
             "cameras": list(robot.camera_names()),
             "session": self._session,
+            "recorded": self._mark is not None,
         }
 
     def _world(self) -> Message | None:

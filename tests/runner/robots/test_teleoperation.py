@@ -5,6 +5,7 @@ the gate, under the control loop, as a goal and in the middle of another one.
 import asyncio
 import itertools
 import math
+import os
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
@@ -19,6 +20,7 @@ from tests.runner.small_robots import FedCamera
 from tests.support.waiting import until
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
+from vram_arbiter.runner.__main__ import parse
 from vram_arbiter.runner.cli.deployment import DeploymentFile, Parts, make_parts
 from vram_arbiter.runner.cli.makers import operators
 from vram_arbiter.runner.control.clock import SystemClock
@@ -26,6 +28,7 @@ from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
 from vram_arbiter.runner.goals.server import GoalServer
 from vram_arbiter.runner.protocols import Goal, GoalTick, SkillEnded
+from vram_arbiter.runner.recording.recorder import DatasetRecorder
 from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
 from vram_arbiter.runner.robots.so101 import RANGES_RAD, so101
 from vram_arbiter.runner.robots.teleoperators import Keyboard, make_teleoperator
@@ -308,6 +311,72 @@ async def test_a_dead_leader_takes_nothing_over(bench: Bench) -> None:
     await goal.result(60)
     with pytest.raises(BadState, match="does not move the robot"):
         await bench.client.take_over("take")
+
+
+async def test_demonstrations_and_take_overs_are_rows_that_lerobot_reads(
+    bus: ServoBus,
+    calibrated: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    forked_writers: None,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """`vram-runner record` keeps one episode and drops one; then a policy's goal is taken over."""
+    recorder = DatasetRecorder(tmp_path / "set", rate_hz=RATE_HZ, cameras=(), robot="bench")
+    await asyncio.to_thread(recorder.start)
+    async with AsyncExitStack() as stack:
+        bench = await bench_of(stack, bus, calibrated, tmp_path, recorder)
+        read, write = os.pipe()
+        monkeypatch.setattr("sys.stdin", stack.enter_context(os.fdopen(read)))
+        words = ["record", "wave", "--episodes", "2", "--endpoint", bench.client.endpoint]
+        args = parse(words)
+        recording = asyncio.create_task(args.run(args))
+        for number, verdict in enumerate(("k", "d", "k")):
+            os.write(write, b"\n")
+            ticks = len(bench.ticks.ticks)
+            while len(bench.ticks.ticks) < ticks + 5:
+                await asyncio.sleep(0.01)
+            os.write(write, f"\n{verdict}\n".encode())
+            while recorder.counts.episodes + recorder.counts.discarded <= number:
+                await asyncio.sleep(0.01)
+        assert await recording == 0
+        os.close(write)
+        assert "2 of 2 episodes are kept" in capsys.readouterr().out
+
+        goal = await bench.client.send_goal("test/grab", prompt="grab it")
+        while len(bench.sidecar.observations) < 2:
+            await asyncio.sleep(0.01)
+        assert parse(["takeover"]).do == "take"
+        for do in ("take", "give-back"):
+            args = parse(["takeover", do, "--endpoint", bench.client.endpoint])
+            assert await args.run(args) == 0
+            ticks = len(bench.ticks.ticks)
+            while len(bench.ticks.ticks) < ticks + 5:
+                await asyncio.sleep(0.01)
+        await bench.until_phase("running")
+        await goal.cancel()
+        await goal.result(60)
+    await asyncio.to_thread(recorder.close)
+
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    import datasets
+    from lerobot.datasets import LeRobotDataset
+
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
+    dataset = LeRobotDataset("local/set", root=tmp_path / "set", video_backend="pyav")
+    assert dataset.meta.total_episodes == 3
+    assert dataset.features["intervention"] == {"dtype": "bool", "shape": (1,), "names": None}
+    rows = [dataset[index] for index in range(len(dataset))]
+    shown = {
+        episode: [bool(row["intervention"]) for row in rows if row["episode_index"] == episode]
+        for episode in range(3)
+    }
+    assert {row["task"] for row in rows if row["episode_index"] < 2} == {"wave"}
+    assert all(shown[0][:-1])
+    assert all(shown[1][:-1])
+    told = [tick.intervention for tick in bench.ticks.ticks if tick.goal.rskill_id == "test/grab"]
+    assert shown[2] == told[-len(shown[2]) :]
+    assert {*shown[2]} == {True, False}
 
 
 def test_keys_move_joints_while_they_are_pressed(monkeypatch: pytest.MonkeyPatch) -> None:
