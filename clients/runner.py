@@ -36,6 +36,7 @@ from vram_arbiter.schemas.goals import (
     RunnerRequest,
     SendGoal,
     ShutdownRunner,
+    TakeOverGoal,
 )
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.endpoints import program_endpoint
@@ -53,9 +54,10 @@ MARK_TIMEOUT_S = 90.0  # the dataset's writer may be closing an episode's files
 RESULT_POLL_S = 1.0  # while waiting for a result push: ask, in case contact was lost meanwhile
 ENDED = ("succeeded", "failed", "canceled", "deadline")
 FEEDBACK_MAX = 1000  # kept for a reader that is late; the oldest go first
-
+TAKE_OVER_TIMEOUT_S = 30.0  # the teleoperator connects, and the policy's use ends
 
 Verdict = Literal["success", "failure", "discard"]
+Hands = Literal["take", "give_back", "end"]
 
 
 class Goal:
@@ -259,6 +261,14 @@ class RunnerClient:
         Raises BadState when nothing is recorded, BadRequest for another goal."""
         request = MarkEpisode(verdict=verdict, goal_id=goal_id)
         return await self.call(request, timeout_s=MARK_TIMEOUT_S)
+
+    async def take_over(self, do: Hands, goal_id: str = "") -> Message:
+        """Take the robot for the operator, give it back to the goal's skill, or end the goal as
+        done.
+
+        Raises BadState where that cannot be, and what keeps the teleoperator from starting."""
+        request = TakeOverGoal(do=do, goal_id=goal_id)
+        return await self.call(request, timeout_s=TAKE_OVER_TIMEOUT_S)
 
     async def ping(self, *, timeout_s: float = 1.0) -> Message:
         return await self._exchange(PingRunner(), timeout_s)

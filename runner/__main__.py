@@ -22,11 +22,11 @@ from vram_arbiter.schemas.runtime.telemetry.commands import Command, command
 from vram_arbiter.schemas.runtime.version import add_version
 
 COMMANDS = (
-    "sim", "benchmark", "deploy", "estop", "goal", "state", "frame", "reset", "mark", "episodes",
-    "replay", "ros2", "rosbag",
+    "sim", "benchmark", "deploy", "estop", "goal", "state", "frame", "reset", "mark", "takeover",
+    "record", "episodes", "replay", "ros2", "rosbag",
 )  # fmt: skip
 URGENT = "estop"
-CLIENTS = (URGENT, "goal", "state", "frame", "reset", "mark")  # they use no GPU
+CLIENTS = (URGENT, "goal", "state", "frame", "reset", "mark", "takeover", "record")  # without a GPU
 
 
 def parser(names: Sequence[str] = COMMANDS) -> argparse.ArgumentParser:

@@ -66,6 +66,7 @@ class Goal:
     """One accepted goal.
 
     `deadline_s` is resolved (seconds from acceptance); `max_ticks` counts ticks with the robot.
+    `from_here`: the operator gives it back, and it goes on where the robot is.
     """
 
     goal_id: str
@@ -76,6 +77,7 @@ class Goal:
     deadline_s: float = 0.0
     max_ticks: int | None = None
     traceparent: str | None = None
+    from_here: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,13 +96,14 @@ class Act:
     """Apply this one-step action now.
 
     `chunk` comes with the first action of a chunk. `problem` says how the action falls short of
-    what was asked for.
+    what was asked for. `operator`: a person moves the robot.
     """
 
     action: Action
     chunk_index: int | None = None
     chunk: ChunkStart | None = None
     problem: str = ""
+    operator: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,12 +111,14 @@ class Hold:
     """Nothing to apply this tick (an answer is under way): keep the pose.
 
     `withheld`: there was an action, and it cannot be carried out; `reason` is a violation.
-    `standing`: an action was due in the middle of a motion, and there was none.
+    `standing`: an action was due in the middle of a motion, and there was none. `operator`: a
+    person has the robot.
     """
 
     reason: str
     withheld: bool = False
     standing: bool = False
+    operator: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +126,7 @@ class Done:
     """The skill ran to its end; `data` goes into the goal's result."""
 
     data: GoalData = field(default_factory=dict)
+    operator: ClassVar[bool] = False
 
 
 StepOutcome = Act | Hold | Done
@@ -206,7 +212,7 @@ class GoalTick:
 
     `targets` are the joint targets in force, rad by joint: a joint without a new target keeps its
     last; a joint without any is missing. `base_velocity` is the base's command (m/s, m/s, rad/s),
-    None without a base.
+    None without a base. `intervention`: an operator had the robot.
     """
 
     goal: Goal
@@ -214,6 +220,7 @@ class GoalTick:
     result: TickResult
     targets: Mapping[str, float]
     base_velocity: tuple[float, float, float] | None = None
+    intervention: bool = False
 
 
 class TickSink(Protocol):

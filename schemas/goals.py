@@ -117,6 +117,16 @@ class MarkEpisode(RunnerCall):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TakeOverGoal(RunnerCall):
+    """The operator takes the robot from the skill of the goal that runs, gives it back, or ends the
+    goal as done. "" takes that goal. Refused with `bad_state` where that cannot be."""
+
+    op: Literal["take_over"] = "take_over"
+    do: Literal["take", "give_back", "end"]
+    goal_id: Name | Literal[""] = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PingRunner(RunnerCall):
     op: Literal["ping"] = "ping"
 
@@ -136,6 +146,7 @@ RunnerRequest = (
     | GetGroundTruth
     | ResetWorld
     | MarkEpisode
+    | TakeOverGoal
     | PingRunner
     | ShutdownRunner
 )

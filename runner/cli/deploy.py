@@ -60,6 +60,7 @@ from vram_arbiter.runner.protocols import DeadlinePolicy, GoalData
 from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
 from vram_arbiter.runner.safety.estop_mark import EstopMark
 from vram_arbiter.runner.sensors.ros2_estop import estop_topic, listened_topic
+from vram_arbiter.runner.skills import teleop
 from vram_arbiter.schemas.config.robot import RobotEnvironment
 from vram_arbiter.schemas.errors import (
     AlreadyRunning,
@@ -131,6 +132,8 @@ class Deploy:
         parts = make_parts(self._file, self._clock)
         recorder = None
         manifests = read_manifests(self._args.skills or [default_skills()])
+        if parts.teleoperator is not None:
+            manifests.append(teleop.MANIFEST)
         check = self._offered(parts, manifests, None)
         given = sidecars_given(self._args.sidecar)
         self._watches = watches(self._file, manifests, given, os.environ)
@@ -344,8 +347,10 @@ def claim(robot: RobotEnvironment, stack: contextlib.AsyncExitStack) -> None:
     second runner touches the motors of the first.
     """
     _claim(f"robot {robot.robot_id}", robot.robot_id, stack)
-    if port := robot.hal.transport.get("port"):
-        _claim(f"port {port}", os.path.realpath(str(port)), stack)
+    sections = (robot.hal, robot.teleop)
+    for port in (one.transport.get("port") for one in sections if one is not None):
+        if port:
+            _claim(f"port {port}", os.path.realpath(str(port)), stack)
 
 
 def _robot_file(kind: str, key: str, suffix: str) -> Path:

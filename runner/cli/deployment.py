@@ -18,6 +18,7 @@ from vram_arbiter.runner.recording.columns import whole_rate
 from vram_arbiter.runner.recording.commit import check_folder
 from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.body import body_of
+from vram_arbiter.runner.robots.teleoperators import Teleoperator, make_teleoperator
 from vram_arbiter.runner.robots.units import LerobotUnits
 from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.runner.sensors.ros2_estop import listened_topic
@@ -85,6 +86,7 @@ class Parts:
     readers: tuple[SensorReader, ...]
     gate: RobotGate
     lerobot_units: LerobotUnits | None = None  # None: lerobot does not know such a robot
+    teleoperator: Teleoperator | None = None
 
 
 def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
@@ -111,6 +113,18 @@ def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
         hal = make_hal(robot.hal)
     except ConfigError as error:
         raise file.merged([*errors, file.located(error, "hal")]) from error
+    teleoperator = None
+    if robot.teleop is not None:
+        try:
+            teleoperator = make_teleoperator(
+                robot.teleop,
+                hal.description,
+                hal.lerobot_units,
+                period_s=1.0 / robot.rate_hz,
+                clock=clock,
+            )
+        except ConfigError as error:
+            errors.append(file.located(error, "teleop"))
     if robot.save_dir is not None:
         try:
             whole_rate(robot.rate_hz)
@@ -136,7 +150,7 @@ def make_parts(file: DeploymentFile, clock: Clock) -> Parts:
         raise file.merged([*errors, file.error(("hal.adapter", text))]) from error
     if errors:
         raise file.merged(errors)
-    return Parts(hal, tuple(readers), gate, hal.lerobot_units)
+    return Parts(hal, tuple(readers), gate, hal.lerobot_units, teleoperator)
 
 
 def unkept(file: DeploymentFile, parts: Parts, catalogue: Catalogue) -> tuple[str, ...]:
@@ -330,6 +344,8 @@ def plan(
         lines.append(("safety", "none given: only the joints' own ranges and speeds are limits"))
     if (button := listened_topic(robot)) is not None:
         lines.append(("estop", f"also by {button} (std_msgs/Bool)"))
+    if robot.teleop is not None:
+        lines.append(("operator", f"by {robot.teleop.adapter}, on `record` and `takeover`"))
     if robot.ros_actions:
         names = ", ".join(robot.ros_actions)
         lines.append(("actions", f"by ROS 2 servers, past this runner's gate and motors: {names}"))

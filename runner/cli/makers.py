@@ -10,6 +10,7 @@ from vram_arbiter.runner.cli.common import sidecars_given
 from vram_arbiter.runner.cli.deployment import DeploymentFile, Parts
 from vram_arbiter.runner.goals.catalogue import Maker
 from vram_arbiter.runner.skills.ros_standins import StandIn
+from vram_arbiter.runner.skills.teleop import INTERFACE, Teleop
 from vram_arbiter.schemas.config.robot import RobotEnvironment
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import ConfigError
@@ -34,7 +35,7 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
             given,
             arbiter,
             period_s=1.0 / file.robot.rate_hz,
-            others=ros_servers(file.robot),
+            others={**ros_servers(file.robot), **operators(parts, 1.0 / file.robot.rate_hz)},
         )
 
     return make_makers
@@ -57,3 +58,15 @@ def ros_servers(robot: RobotEnvironment) -> dict[str, StandIn]:
         frozenset({ControlMode.JOINT_POSITION, ControlMode.BODY_TWIST}),
     )
     return dict.fromkeys(robot.ros_actions, served)
+
+
+def operators(parts: Parts, period_s: float) -> dict[str, StandIn]:
+    """Return the operator's skill, by interface; empty for a robot without a teleoperator."""
+    if (teleoperator := parts.teleoperator) is None:
+        return {}
+    limits, sent = parts.gate.limits, parts.hal.sent
+    made = StandIn(
+        lambda manifest: Teleop(manifest, teleoperator, limits, period_s=period_s, sent=sent),
+        frozenset({ControlMode.JOINT_POSITION}),
+    )
+    return {INTERFACE: made}

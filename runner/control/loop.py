@@ -375,6 +375,7 @@ class ControlLoop[R: Robot]:
             result,
             dict(self.robot.targets()),
             _base_command(self.world, tick.decision.action),
+            tick.decision.intervention,
         )
 
     # -- result

@@ -51,6 +51,7 @@ class Decision:
     safety_ms: float = 0.0
     chunk_index: int | None = None
     violations: tuple[str, ...] = ()
+    intervention: bool = False  # an operator has the robot
 
 
 @dataclass(slots=True)
@@ -63,6 +64,7 @@ class _Active:
     ticks: int = 0
     acted: bool = False  # it gave an action
     passed: bool = False  # an action of this tick passed the gate and was not late
+    operated: bool = False  # an operator has the robot in this tick
     tally: Tally = field(default_factory=Tally)
     detail: str = ""
 
@@ -158,6 +160,7 @@ class SkillSlot:
             self.end(SkillEnded({"truncated": True}, error))
             return decision
         self.follower.goal_asked(active.goal)
+        decision.intervention = active.operated
         asked_s = self._clock.now_s()
         try:
             with tracing.span(telemetry.SPAN_INFERENCE):
@@ -174,6 +177,7 @@ class SkillSlot:
             return decision
         decision.inference_ms = (self._clock.now_s() - asked_s) * 1e3
         meters.measure(telemetry.METRIC_INFERENCE, decision.inference_ms / 1e3, self.labels)
+        active.operated = decision.intervention = outcome.operator
         match outcome:
             case Act(action=action, chunk_index=chunk_index, chunk=chunk, problem=short):
                 active.acted = True
@@ -267,9 +271,9 @@ class SkillSlot:
         """Withhold an action. Too many in a row fail the goal, with the cause of the first one.
 
         A skill does not have to notice that its actions are not sent: it would play to its end and
-        report success.
+        report success. An operator does notice it: an operator's actions are not counted.
         """
-        self._withhold(active, reason, asked=True)
+        self._withhold(active, reason, asked=not active.operated)
         if isinstance(active.skill, Paced):
             active.skill.withheld()
         streak = active.streak

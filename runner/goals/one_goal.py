@@ -19,13 +19,16 @@ from vram_arbiter.clients.net.server import Peer
 from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
+from vram_arbiter.runner.goals.take_over import OPERATOR, TakeOver
 from vram_arbiter.runner.protocols import Goal, GoalData, Progress, Skill, SkillEnded, SkillKey
+from vram_arbiter.runner.skills import teleop
 from vram_arbiter.runner.skills.residency import Residency
 from vram_arbiter.schemas.errors import (
     BadRequest,
     BadState,
     GoalRejected,
     InternalError,
+    UnknownSkill,
     VramError,
 )
 from vram_arbiter.schemas.goals import FeedbackPush, ResultPush, SendGoal
@@ -60,6 +63,7 @@ class _Running:
     canceled: bool = False
     stopped_by: VramError | None = None
     skill: Skill | None = None
+    hands: TakeOver | None = None  # once the skill is started
     phase: str = "acquiring"
     so_far: GoalData = field(
         default_factory=dict
@@ -199,6 +203,32 @@ class OneGoal:
             f"there is no goal {goal_id}", hint=f"the last {RESULTS_KEPT} results are kept"
         )
 
+    async def take_over(self, do: Literal["take", "give_back", "end"], goal_id: str) -> Message:
+        """Change the hands of the goal that runs and return the reply.
+
+        Raises BadState, and what keeps the teleoperator from starting.
+        """
+        running = self._running
+        if running is None or running.hands is None or goal_id not in ("", running.goal.goal_id):
+            raise BadState(f"goal {goal_id or '?'} does not move the robot")
+        match do:
+            case "take":
+                await running.hands.take(await self._operator())
+            case "give_back":
+                running.hands.give_back()
+            case "end":
+                await running.hands.end()
+        return {"goal_id": running.goal.goal_id}
+
+    async def _operator(self) -> Skill:
+        """Return the operator's skill. Raises BadState for a robot without a teleoperator."""
+        try:
+            key, make, _ = self._catalogue.find(teleop.NAME)
+        except UnknownSkill as error:
+            hint = "name one under `teleop` in the robot's file"
+            raise BadState(f"there is no teleoperator: {error.message}", hint=hint) from error
+        return await self._residency.acquire(key, make)
+
     # -- a goal
     async def _execute(self, running: _Running, make: Callable[[], Skill]) -> None:
         """Run a goal within one span, `rskill.goal`: parent of activation and ticks."""
@@ -250,6 +280,8 @@ class OneGoal:
             error = InternalError(f"{type(raised).__name__}: {raised}", hint="see the runner's log")
         before = _before_motion(running)
         running.phase = FINISHING
+        if running.hands is not None:
+            await running.hands.close()
         if running.skill is not None:
             await self._finish(running.skill)
         telling.cancel()
@@ -290,11 +322,26 @@ class OneGoal:
             self._caption(running)
             await self._residency.start(skill, goal)
 
-        def begun() -> None:
-            running.phase = "running"
+        def show(phase: str) -> None:
+            running.phase = phase
             self._caption(running)
 
-        return await self._control.run_skill(skill, goal, begun, running.so_far.update)
+        hands = TakeOver(
+            control=self._control,
+            goal=goal,
+            skill=skill,
+            start=self._residency.start,
+            finish=self._finish,
+            show=show,
+            fail=self.stop,
+            operated=goal.rskill_id == teleop.NAME,
+        )
+
+        def begun() -> None:
+            running.hands = hands
+            show("running")
+
+        return await self._control.run_skill(hands.relay, goal, begun, running.so_far.update)
 
     async def _conclude(
         self,
@@ -333,7 +380,9 @@ class OneGoal:
     async def _tell(self, running: _Running) -> None:
         while True:
             progress = self._robot.progress
-            if running.phase != "running":
+            if running.phase == OPERATOR:
+                progress = replace(progress, state=OPERATOR)
+            elif running.phase != "running":
                 starting = "" if running.skill is None else running.skill.phase
                 progress = Progress(0.0, running.phase, detail=starting)
             now_s = self._clock.now_s()

@@ -49,6 +49,7 @@ from vram_arbiter.schemas.goals import (
     RunnerRequest,
     SendGoal,
     ShutdownRunner,
+    TakeOverGoal,
 )
 from vram_arbiter.schemas.plain import Message
 
@@ -63,7 +64,7 @@ RUNNER_REQUEST: Final[TypeAdapter[RunnerRequest]] = TypeAdapter(
 )
 OPS = (
     "goal", "cancel", "result", "frame", "state", "skills", "ground_truth", "reset", "mark",
-    "ping", "shutdown",
+    "take_over", "ping", "shutdown",
 )  # fmt: skip
 
 
@@ -244,6 +245,8 @@ class GoalServer:
                     return {
                         **await asyncio.to_thread(lambda: mark(request.goal_id, request.verdict))
                     }
+            case TakeOverGoal():
+                return await self._goals.take_over(request.do, request.goal_id)
             case PingRunner():
                 goal = self._goals.goal
                 return {
@@ -289,6 +292,7 @@ class GoalServer:
             "estop": robot.estop.message if robot.estop is not None else None,
             "cameras": list(robot.camera_names()),
             "session": self._session,
+            "recorded": self._mark is not None,
         }
 
     def _world(self) -> Message | None:

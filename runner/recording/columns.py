@@ -23,6 +23,7 @@ NO_CHUNK = -1  # chunk_index of a tick that was not played from a chunk
 STATE, ACTION = "observation.state", "action"
 PICTURES = "observation.images."
 DONE = "next.done"
+INTERVENTION = "intervention"  # as lerobot's `dagger` strategy of lerobot-rollout calls it
 SUCCESS = "next.success"  # only of worlds that judge: a skill that says "done" does not know
 
 
@@ -121,6 +122,7 @@ def _own(
     chunk = NO_CHUNK if result.chunk_index is None else result.chunk_index
     return columns | {
         DONE: _one("bool", False),
+        INTERVENTION: _one("bool", tick.intervention),
         "tick.index": _one("int64", result.tick_idx),
         "tick.stamp_ns": _one("int64", result.stamp_ns),
         "tick.timings_ms": _vector({name: getattr(result, f"{name}_ms") for name in TIMINGS}),

@@ -21,6 +21,7 @@ from vram_arbiter.runner.protocols import (
 )
 from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.kinematic import KinematicTwin
+from vram_arbiter.runner.robots.lerobot_devices import LEROBOT, bus_unit, make_device
 from vram_arbiter.runner.robots.lerobot_robot import LerobotHal, can_switch_off
 from vram_arbiter.runner.robots.models import frames_of, load_model
 from vram_arbiter.runner.robots.params import (
@@ -35,13 +36,12 @@ from vram_arbiter.runner.robots.params import (
     wrong,
 )
 from vram_arbiter.runner.robots.so101 import so101
-from vram_arbiter.runner.robots.units import POSITION, JointUnit, Scale, scale_of_unit
+from vram_arbiter.runner.robots.units import POSITION, Scale, scale_of_unit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.findings import did_you_mean, dotted
 from vram_arbiter.schemas.yamltext import Mistake, config_error
 
-LEROBOT = "lerobot:"
 MUJOCO = "so101_mujoco"
 KINEMATIC = "so101_kinematic"
 MODEL = "mujoco"
@@ -211,7 +211,7 @@ def _has_actuators(model: Any, robot: RobotDescription) -> None:
 # -- lerobot
 def _lerobot(config: HalConfig, clock: Clock | None) -> HalBase:
     params = read_params(LerobotParams, config)
-    robot = _robot(config)
+    robot = make_device("robot", config.adapter.removeprefix(LEROBOT), config.transport)
     features = list(robot.action_features)
     if others := [name for name in features if not name.endswith(POSITION)]:
         raise wrong(
@@ -249,64 +249,6 @@ def _lerobot(config: HalConfig, clock: Clock | None) -> HalBase:
     return LerobotHal(robot, description, scales, estop=params.estop, clock=clock)
 
 
-def _robot(config: HalConfig) -> Any:
-    """Return a lerobot robot, not connected."""
-    kind = config.adapter.removeprefix(LEROBOT)
-    try:
-        from lerobot.robots import RobotConfig, make_robot_from_config
-    except ImportError as error:
-        raise wrong(
-            ("adapter",),
-            f"{config.adapter} needs lerobot: pip install 'vram-arbiter[sidecars]' ({error})",
-        ) from error
-    known = _robot_types(RobotConfig, kind)
-    if kind not in known:
-        raise wrong(("adapter",), f"lerobot knows no robot {kind!r}{did_you_mean(kind, known)}")
-    config_class = RobotConfig.get_choice_class(kind)
-    fields = {field.name for field in dataclasses.fields(config_class) if field.init}
-    if config.transport.get("cameras"):
-        raise wrong(("transport", "cameras"), "cameras belong under `sensors`")
-    for key in config.transport:
-        if key not in fields:
-            raise wrong(("transport", key), f"unknown key{did_you_mean(key, sorted(fields))}")
-    import draccus
-
-    try:
-        # lerobot's own reader: it turns texts into the types of its fields
-        return make_robot_from_config(draccus.decode(config_class, dict(config.transport)))
-    except draccus.utils.DecodingError as error:
-        path = tuple(str(part) for part in getattr(error, "key_path", ()))
-        raise wrong(("transport", *path), str(getattr(error, "message", error))) from error
-    except (ImportError, TypeError, ValueError, OSError) as error:
-        raise wrong(("transport",), f"lerobot cannot make a {kind}: {error}") from error
-
-
-def _robot_types(registry: Any, wanted: str) -> list[str]:
-    """Return lerobot's robot types.
-
-    Its packages register theirs on import, hence one after the other until `wanted` is there.
-    """
-    import importlib
-    import pkgutil
-
-    import lerobot.robots
-    from lerobot.utils.import_utils import register_third_party_plugins
-
-    if wanted not in registry.get_known_choices():
-        for module in pkgutil.iter_modules(lerobot.robots.__path__):
-            if not module.ispkg:
-                continue
-            try:
-                importlib.import_module(f"lerobot.robots.{module.name}")
-            except ImportError:  # its driver is not installed
-                continue
-            if wanted in registry.get_known_choices():
-                break
-        else:
-            register_third_party_plugins()
-    return sorted(registry.get_known_choices())
-
-
 def _joint(
     name: str, params: JointParams, robot: Any, known: RobotDescription | None
 ) -> tuple[Joint, Scale] | str:
@@ -324,7 +266,7 @@ def _joint(
         upper = built_in.upper_rad if upper is None else upper
         speed = built_in.max_speed_rad_s if speed is None else speed
         gripper = built_in.gripper if gripper is None else gripper
-    unit = params.unit or _bus_unit(robot, name)
+    unit = params.unit or bus_unit(robot, name)
     wanted = {"unit": unit, "lower_rad": lower, "upper_rad": upper, "max_speed_rad_s": speed}
     if missing := [key for key, value in wanted.items() if value is None]:
         them = "it" if len(missing) == 1 else "them"
@@ -338,17 +280,3 @@ def _joint(
     ):  # the file limits the joint; it does not move the ends of its percentages
         ends = built_in.lower_rad, built_in.upper_rad
     return joint, scale_of_unit(unit, *ends, params.sign, params.offset_rad)
-
-
-def _bus_unit(robot: Any, name: str) -> JointUnit | None:
-    """Return what lerobot's motor bus turns this motor's counts into."""
-    motor = getattr(getattr(robot, "bus", None), "motors", {}).get(name)
-    return (
-        {
-            "degrees": JointUnit.DEG,
-            "range_0_100": JointUnit.PERCENT,
-            "range_m100_100": JointUnit.SIGNED_PERCENT,
-        }.get(str(motor.norm_mode.value))
-        if motor is not None
-        else None
-    )

@@ -121,9 +121,9 @@ class LerobotParams(ModelParams):
     estop: Estop = "hold"
 
 
-def wrong(path: Path, problem: str) -> ConfigError:
-    """Return one mistake below `hal`."""
-    return config_error(SOURCE, [Mistake(0, dotted(("hal", *path)), problem)])
+def wrong(path: Path, problem: str, section: str = "hal") -> ConfigError:
+    """Return one mistake below a section of the file."""
+    return config_error(SOURCE, [Mistake(0, dotted((section, *path)), problem)])
 
 
 def read_params[T: Params](kind: type[T], config: HalConfig) -> T:

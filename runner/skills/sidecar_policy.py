@@ -168,7 +168,7 @@ class SidecarPolicy(SkillBase):
         await self._occupy(goal)
         begun = await self._client.reset({TASK_KEY: self._task}, token=self._token)
         rollout = self._wiring.rollout
-        self._ramp, self._running, self._commanded = None, False, {}
+        self._ramp, self._running, self._commanded = None, goal.from_here, {}
         self._recent.clear()
         self._seen = deque(maxlen=_count(begun, "n_obs_steps") or rollout.n_obs_steps or 1)
         # of this goal: a late request without a token would load the model anew

@@ -108,6 +108,15 @@ class HalConfig(_Section):
     params: dict[str, JsonValue] = {}
 
 
+class TeleopConfig(_Section):
+    """The operator's device: a leader arm or a keyboard."""
+
+    adapter: Text
+    """`lerobot:TYPE`, one of lerobot's teleoperators, e.g. `lerobot:so101_leader`."""
+    transport: dict[str, JsonValue] = {}
+    """The fields of lerobot's own configuration of it."""
+
+
 class TaskSpec(_Section):
     """What the robot is to do when no goals arrive."""
 
@@ -168,6 +177,8 @@ class RobotEnvironment(_Section):
     ] = ()
     """Interfaces of `ros_action` skills that ROS 2 servers execute. Their motion passes neither
     this runner's safety gate nor its emergency stop, which only cancels their goals."""
+    teleop: TeleopConfig | None = None
+    """By it an operator moves the robot (`vram-runner record`, `takeover`); null: by none."""
     task: TaskSpec | None = None
     vla: VlaSpec | None = None
     safety: SafetyEnvelope | None = None

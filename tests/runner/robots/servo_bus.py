@@ -64,6 +64,10 @@ class ServoBus:
         """From now on nobody answers."""
         self._silent.set()
 
+    def mend(self) -> None:
+        """Plug the cable in again."""
+        self._silent.clear()
+
     # -- the wire
     def _serve(self) -> None:
         heard = b""
