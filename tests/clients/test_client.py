@@ -107,10 +107,7 @@ async def test_status_is_whole_though_it_comes_in_pages(
         page = await clients[0].ask(Status())
         assert (len(page.leases), page.totals) == (STATUS_PAGE, Totals(waiters + 1, waiters))
         whole = await clients[0].status()
-        assert [lease.position for lease in whole.leases] == [
-            None,
-            *range(1, waiters + 1),
-        ]
+        assert [lease.position for lease in whole.leases] == [None, *range(1, waiters + 1)]
         assert whole.next is None
         vramctl = str(Path(sys.executable).with_name("vramctl"))
         command = [vramctl, "status", "--json", "--endpoint", arbiter_daemon.endpoint]
@@ -388,10 +385,7 @@ async def test_a_word_that_the_arbiter_refuses_is_said_again(
 
         monkeypatch.setattr(client._session.protocol.holdings, "ask", counted)
         monkeypatch.setattr(client._session, "reply", refused_once)
-        async with (
-            AsyncClient("other", endpoint=arbiter_daemon.endpoint) as other,
-            within(WAIT_S),
-        ):
+        async with AsyncClient("other", endpoint=arbiter_daemon.endpoint) as other, within(WAIT_S):
             await (await other.acquire(spec("b", 5))).release()
             await lease.wait_gone()
         assert len(said) == 2

@@ -15,14 +15,7 @@ from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.rpc.registry import SessionSettings
 from vram_arbiter.arbiter.rpc.session import SessionTable
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.ids import (
-    ClientId,
-    LeaseId,
-    ProcessKey,
-    RequestId,
-    Token,
-    UseId,
-)
+from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.runtime.peercred import Peer
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 from vram_arbiter.schemas.wire import requests as wire
@@ -78,11 +71,7 @@ class Bench:
         return no_reason(consumer)
 
     def history(
-        self,
-        after: int,
-        limit: int,
-        kinds: tuple[str, ...],
-        done: Callable[[HistoryReply], None],
+        self, after: int, limit: int, kinds: tuple[str, ...], done: Callable[[HistoryReply], None]
     ) -> None:
         self.questions.append((after, limit, kinds))
         done(NO_EVENTS)

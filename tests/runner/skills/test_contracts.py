@@ -400,11 +400,7 @@ class Answers:
 
 
 def run_goal(
-    panda: Bench,
-    run_async: Callable[[Any], Any],
-    client: Any,
-    manifest: RSkillManifest,
-    ticks: int,
+    panda: Bench, run_async: Callable[[Any], Any], client: Any, manifest: RSkillManifest, ticks: int
 ) -> list[SkillEnded]:
     """Loop, skill, gate and twin as `vram-runner deploy` composes them."""
     wiring = wire_up(manifest, panda.robot, panda.robot.rest_pose_rad)
