@@ -1,6 +1,7 @@
 """For every test of the product: a real arbiter daemon in a folder of its own, and Hypothesis's
 profiles."""
 
+import gc
 import logging
 import os
 import signal
@@ -91,6 +92,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return next(found, len(LONGEST))
 
     items.sort(key=rank)
+
+
+def pytest_collection_finish() -> None:
+    """Let the garbage collector pass over modules and items, which stay: scanning them takes up to
+    7 % of a test's time."""
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

@@ -75,7 +75,7 @@ class SizeLimit:
 
 @pytest.fixture
 def on_small_disk() -> Iterator[ArbiterProcess]:
-    made = ArbiterProcess(config="record:\n  enabled: false\n")
+    made = ArbiterProcess(config="record:\n  enabled: false\n", prepared=True)
     yield made
     made.close()
 

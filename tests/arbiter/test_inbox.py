@@ -256,10 +256,7 @@ def test_what_is_handled_is_recorded_once_its_answers_are_out() -> None:
         first.post(left("a"))
         assert told == ["performed", (core.times[0], left("a"), [Note("seen", {"number": 1})])]
         first.post(left("b"))
-        assert told[2:4] == [
-            "performed",
-            (core.times[1], left("b"), [Note("seen", {"number": 2})]),
-        ]
+        assert told[2:4] == ["performed", (core.times[1], left("b"), [Note("seen", {"number": 2})])]
         assert str(told[4]) == "no disk"
         core.broken = True
         inbox().post(left("c"))

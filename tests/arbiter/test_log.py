@@ -4,11 +4,11 @@ import json
 import logging
 import re
 import threading
-import time
 from collections.abc import Iterator
 
 import pytest
 
+from tests.support.waiting import until
 from vram_arbiter.arbiter import log as telemetry
 from vram_arbiter.arbiter.log import LINES_MAX, REFUSALS_BURST, REFUSED_USERS_MAX, RefusalLog
 
@@ -92,8 +92,7 @@ def test_a_log_that_is_not_read_holds_up_nothing_and_loses_lines_in_words() -> N
     for _ in range(LINES_MAX + 10):
         telemetry.log_event(EVENT)
     read.set()
-    while len(lines) < LINES_MAX:
-        time.sleep(0.001)
+    until(lambda: len(lines) >= LINES_MAX)
     telemetry.log_event(EVENT)
     close()
     logging.getLogger("x").warning("after the end")

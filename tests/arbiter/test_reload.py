@@ -206,8 +206,5 @@ def test_only_live_keys_change_what_is_in_force() -> None:
     before = ArbiterConfig()
     after = load_config("revoke: {deadline_s: 9}\nwire: {heartbeat_s: 9}\n", "x")
     live, others = reload.changes(before, after)
-    assert (live, others) == (
-        {"revoke.deadline_s": (30.0, 9.0)},
-        {"wire.heartbeat_s": (2.0, 9.0)},
-    )
+    assert (live, others) == ({"revoke.deadline_s": (30.0, 9.0)}, {"wire.heartbeat_s": (2.0, 9.0)})
     assert reload.changes(before, reload.merged(before, after)) == (live, {})

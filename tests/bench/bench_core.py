@@ -11,15 +11,7 @@ from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Push, Reply, Sample
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
-from vram_arbiter.schemas.ids import (
-    ClientId,
-    GpuId,
-    LeaseId,
-    ProcessKey,
-    RequestId,
-    Token,
-    UseId,
-)
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.pushes import GrantedPush
 from vram_arbiter.schemas.wire.replies import AcquireReply

@@ -48,12 +48,7 @@ def run(suite: Suite) -> None:
     suite.compare("ping", found["ping"], found[FLOOR], "F", None)
     suite.compare("grant: acquire on a free GPU", found["grant"], found[FLOOR], "F", 1.5)
     suite.compare(
-        "grant: acquire on a free GPU, by p99",
-        found["grant"],
-        found[FLOOR],
-        "F's p99",
-        2.0,
-        of=p99,
+        "grant: acquire on a free GPU, by p99", found["grant"], found[FLOOR], "F's p99", 2.0, of=p99
     )
     if "redis" in found:
         suite.time(

@@ -80,9 +80,7 @@ def updates(suite: Suite) -> None:
         suite.limit(name, times, p99_max_us=200_000)
         share = busy_percent(daemon.pid, suite.size(10, 2))
         suite.figure(f"CPU with {LEASES} leases and one page open", share, "% of a core")
-        cycles = {
-            "open": lambda: elapsed_us(lambda: peer.release(peer.acquire())),
-        }
+        cycles = {"open": lambda: elapsed_us(lambda: peer.release(peer.acquire()))}
         found = in_turns(suite.size(300, 50), cycles)["open"]
         suite.time("acquire + release meanwhile", found)
 

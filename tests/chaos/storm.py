@@ -90,7 +90,7 @@ class Storm:
         self._seed = seed
         self._out = out
         self._random = random.Random(seed)
-        self._arbiter = ArbiterProcess(config=CONFIG)
+        self._arbiter = ArbiterProcess(config=CONFIG, prepared=True)
         self._traces = self._arbiter.runtime / "traces"
         self._traces.mkdir()
         self._mounted = self._mount_state()

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import signal
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 import anyio
 import anyio.to_thread
 import pytest
-from anyio.streams.buffered import BufferedByteReceiveStream
 
 from tests.support.beside import Canceled, Start, within
 from tests.support.leases import states
@@ -35,7 +33,6 @@ from vram_arbiter.schemas.wire.replies import AnyReply
 from vram_arbiter.schemas.wire.requests import Acquire, Evict, Status, Unloading
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import Totals
-from vram_arbiter.sidecars.device.fake import FakeMemory
 
 pytestmark = [
     pytest.mark.anyio,
@@ -107,10 +104,7 @@ async def test_status_is_whole_though_it_comes_in_pages(
         page = await clients[0].ask(Status())
         assert (len(page.leases), page.totals) == (STATUS_PAGE, Totals(waiters + 1, waiters))
         whole = await clients[0].status()
-        assert [lease.position for lease in whole.leases] == [
-            None,
-            *range(1, waiters + 1),
-        ]
+        assert [lease.position for lease in whole.leases] == [None, *range(1, waiters + 1)]
         assert whole.next is None
         vramctl = str(Path(sys.executable).with_name("vramctl"))
         command = [vramctl, "status", "--json", "--endpoint", arbiter_daemon.endpoint]
@@ -388,10 +382,7 @@ async def test_a_word_that_the_arbiter_refuses_is_said_again(
 
         monkeypatch.setattr(client._session.protocol.holdings, "ask", counted)
         monkeypatch.setattr(client._session, "reply", refused_once)
-        async with (
-            AsyncClient("other", endpoint=arbiter_daemon.endpoint) as other,
-            within(WAIT_S),
-        ):
+        async with AsyncClient("other", endpoint=arbiter_daemon.endpoint) as other, within(WAIT_S):
             await (await other.acquire(spec("b", 5))).release()
             await lease.wait_gone()
         assert len(said) == 2
@@ -473,163 +464,3 @@ async def test_subscribers_see_events_in_order(
         assert [event["kind"] for event in (await client.history(kinds=["granted"])).events] == [
             "granted"
         ]
-
-
-async def test_a_restart_of_the_daemon_is_ridden_out(
-    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until, beside: Start
-) -> None:
-    arbiter = make_arbiter().start()
-    async with AsyncClient("t", endpoint=arbiter.endpoint) as client:
-        pinned = await client.acquire(spec("a", 5))
-        waiting = beside(client.acquire(spec("b", 2), WAIT_S))
-        while "b" not in await states(client):
-            await anyio.sleep(0.01)
-        process = arbiter.process
-        assert process is not None
-        process.kill()
-        process.wait()
-        await until(
-            lambda: not client.connected
-        )  # the socket's monitor says so, no heartbeat has to run out
-        asked = beside(client.status())
-        await anyio.to_thread.run_sync(arbiter.start)
-        await until(lambda: client.connected and client.epoch > pinned.token[0])
-        assert (await asked).epoch == client.epoch
-        # the GPU is empty here: whatever the daemon decides about the old lease, the waiter kept
-        # its place
-        if pinned.state == "loading":
-            await pinned.ready()
-        lease = await waiting
-        assert lease.token[0] == client.epoch
-        assert lease.token > pinned.token
-
-
-async def test_self_fencing(
-    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
-) -> None:
-    lost: list[VramError] = []
-    unloaded = anyio.Event()
-
-    async def unload() -> None:
-        unloaded.set()
-
-    arbiter = make_arbiter().start()
-    async with AsyncClient("t", endpoint=arbiter.endpoint) as client:
-        lease = await client.acquire(
-            spec("a", 5), unload=unload, on_lost=lambda _, error: lost.append(error)
-        )
-        await lease.ready()
-        process = arbiter.process
-        assert process is not None
-        process.kill()
-        process.wait()
-        # without an arbiter only: a busy machine may take longer over a short ttl than it lasts
-        client._session.protocol.connection.grace_s = -lease.spec.ttl_s
-        async with within(WAIT_S):
-            await lease.wait_gone()
-        assert unloaded.is_set()
-        assert [type(error) for error in lost] == [LeaseLost]
-        assert "fenced" in str(lease.error)
-        with pytest.raises(LeaseLost):
-            async with lease.use():
-                pytest.fail("a use began on a fenced lease")
-
-
-async def test_a_hung_daemon_is_noticed_by_silence(
-    make_arbiter: Callable[..., ArbiterProcess], until: Until
-) -> None:
-    arbiter = make_arbiter().start()
-    async with AsyncClient("t", endpoint=arbiter.endpoint) as client:
-        client._session.protocol.connection.heartbeat_s = 0.1
-        process = arbiter.process
-        assert process is not None
-        process.send_signal(signal.SIGSTOP)
-        try:
-            await until(lambda: not client.connected)
-        finally:
-            process.send_signal(signal.SIGCONT)
-        await until(lambda: client.connected)
-
-
-RUNNER = """
-import sys
-from vram_arbiter.clients.sync import Client
-token = (int(sys.argv[2]), int(sys.argv[3]))
-with Client("runner") as client, client.use(sys.argv[1], token, "goal") as use:
-    print("in use", flush=True)
-    sys.stdin.readline()
-    print(use.lost, flush=True)
-"""
-
-
-async def test_a_use_begins_without_the_daemon_and_is_told_when_it_is_back(
-    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until
-) -> None:
-    """Regression: a use that began before the client noticed the daemon's death waited until the
-    lease was fenced, and a robot's goal with it."""
-    arbiter = make_arbiter().start()
-    async with AsyncClient("sidecar", endpoint=arbiter.endpoint) as client, within(WAIT_S):
-        lease = await client.acquire(spec("a", 5))
-        await lease.ready()
-        arbiter.kill()
-        async with lease.use("not noticed yet"):
-            await until(lambda: not client.connected)
-            async with lease.use("noticed"):
-                await anyio.to_thread.run_sync(arbiter.start)
-                while not client.connected or (await client.status()).leases[0].uses != 2:
-                    await anyio.sleep(0.01)
-            assert (lease.state, lease.uses) == ("held", 1)
-        while (await client.status()).leases[0].uses:
-            await anyio.sleep(0.01)
-
-
-async def test_leases_and_uses_survive_a_kill_of_the_daemon(
-    make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until, beside: Start
-) -> None:
-    arbiter = make_arbiter().start()
-    memory = FakeMemory(arbiter.gpu_folder, "a", 0)
-    unloaded = anyio.Event()
-
-    async def unload() -> None:
-        memory.free(block)
-        memory.empty_cache()
-        unloaded.set()
-
-    async with AsyncClient("sidecar", endpoint=arbiter.endpoint) as client:
-        lease = await client.acquire(spec("a", 5), unload=unload)
-        block = memory.allocate("a", 5 << 30)
-        await lease.ready(memory.used_bytes())
-        runner = await anyio.open_process(
-            [sys.executable, "-c", RUNNER, lease.lease_id, *map(str, lease.token)],
-            env=arbiter.environ, stderr=None,
-        )  # fmt: skip
-        assert runner.stdout is not None
-        assert runner.stdin is not None
-        said = BufferedByteReceiveStream(runner.stdout)
-        try:
-            assert await said.receive_until(b"\n", 100) == b"in use"
-            process = arbiter.process
-            assert process is not None
-            async with lease.use("request"):
-                process.kill()
-                process.wait()
-                await until(lambda: not client.connected)
-                await anyio.to_thread.run_sync(arbiter.start)
-                await until(lambda: client.connected)
-                async with within(WAIT_S):
-                    while (shown := (await client.status()).leases[0]).uses != 2:
-                        await anyio.sleep(0.01)
-            assert (shown.lease_id, shown.state) == (lease.lease_id, "held")
-            assert client.epoch > lease.token[0]
-            wanted = beside(client.acquire(spec("b", 5), WAIT_S))
-            await until(lambda: lease.revoking)
-            assert not unloaded.is_set()  # the runner's goal goes on
-            await runner.stdin.send(b"end\n")
-            assert await said.receive_until(b"\n", 100) == b"None"
-            second = await wanted
-        finally:
-            await runner.aclose()
-        assert unloaded.is_set()
-        await lease.wait_gone()
-        assert lease.error is None
-        assert second.token > lease.token

@@ -13,12 +13,7 @@ from tests.support.process import ArbiterProcess
 from vram_arbiter.clients import use_context
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease, LeaseState
-from vram_arbiter.schemas.errors import (
-    BadState,
-    LeaseRevoking,
-    WaitTimeout,
-    WouldDeadlock,
-)
+from vram_arbiter.schemas.errors import BadState, LeaseRevoking, WaitTimeout, WouldDeadlock
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.wire.pushes import RevokePush
 from vram_arbiter.schemas.wire.spec import LeaseSpec
@@ -109,10 +104,7 @@ async def test_a_task_that_follows_a_lease_sees_where_it_goes(
     arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
 ) -> None:
     model = Model()
-    async with (
-        AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client,
-        within(WAIT_S),
-    ):
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client, within(WAIT_S):
         detector = await on_standby(client, spec, model)
         assert (detector.state, detector.given_up) == ("held", False)
         policy = await client.acquire(spec("policy", 4), WAIT_S)

@@ -11,12 +11,7 @@ import pytest
 
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.sync import Client
-from vram_arbiter.schemas.errors import (
-    ArbiterUnreachable,
-    BadState,
-    LeaseLost,
-    LeaseRevoking,
-)
+from vram_arbiter.schemas.errors import ArbiterUnreachable, BadState, LeaseLost, LeaseRevoking
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 pytestmark = pytest.mark.e2e

@@ -122,9 +122,7 @@ def test_2_an_unload_that_does_not_unload_is_named_until_its_process_ends(stage:
     waiter.until("ready")
 
 
-def test_3_a_holder_that_is_stopping_for_ever_is_named_and_ended_by_a_person(
-    stage: Stage,
-) -> None:
+def test_3_a_holder_that_is_stopping_for_ever_is_named_and_ended_by_a_person(stage: Stage) -> None:
     """ollama#7606 and others "Stopping…"; llama-swap#125, #138: only SIGKILL helped, and children
     stayed behind."""
     patient = stage.spawn("patient", 5, stuck=True)

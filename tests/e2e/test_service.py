@@ -36,7 +36,7 @@ class Service(ArbiterProcess):
     as a service does."""
 
     def __init__(self, options: str, group: str) -> None:
-        super().__init__()
+        super().__init__(prepared=True)
         self.options = options
         self.group = group
         self.wrapper: list[str] = []

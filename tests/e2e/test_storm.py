@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 def test_a_short_storm_leaves_every_promise_kept(tmp_path: Path) -> None:
     """`make chaos` is the same for five minutes."""
     storm = subprocess.run(
-        [sys.executable, str(ROOT / "tests/chaos/storm.py"), "--seconds", "15", "--faults", "10",
+        [sys.executable, str(ROOT / "tests/chaos/storm.py"), "--seconds", "8", "--faults", "10",
         "--seed", "7", "--out", str(tmp_path)],
         env={**os.environ, "PYTHONPATH": f"{ROOT}/src:{ROOT}"},
         capture_output=True,

@@ -153,13 +153,7 @@ def run_programs(
     programs.start("vram-runner", "sim", "--seed", "1", "--skills", str(endless(folder)))
     asyncio.run(all_up(arbiter.runtime))
     programs.start(
-        "vram-reasoner",
-        "--task",
-        "grab the red cube",
-        "--planner",
-        "openai",
-        "--scene-vlm",
-        "none",
+        "vram-reasoner", "--task", "grab the red cube", "--planner", "openai", "--scene-vlm", "none"
     )
     collector.wait(
         lambda: bool(collector.spans(telemetry.SPAN_SEND)), "action that reaches the robot", MOVES_S

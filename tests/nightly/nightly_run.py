@@ -27,7 +27,7 @@ from tests.support import machines as profiles
 
 ROOT = Path(__file__).resolve().parents[2]
 MACHINES = {  # name → file and class; whoever stands here walks in the night
-    "leases": ("tests/arbiter/core/test_machine.py", "Leases"),
+    "leases": ("tests/arbiter/core/test_machine.py", "Leases")
 }
 PORTION = 250  # histories under one seed
 SPREAD = 1_000_003  # between the seeds of two nights

@@ -6,6 +6,7 @@ mounts go.
 """
 
 import contextlib
+import json
 import os
 import select
 import shutil
@@ -16,6 +17,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from tests.packaging.installed import DEPENDENCIES, PYTHON, TREE, install_into
 
@@ -71,6 +73,7 @@ class Machine:
         self._init: int | None = None  # pidfd
         self._init_pid = 0
         self._process: subprocess.Popen[bytes] | None = None
+        self._answering: subprocess.Popen[str] | None = None
         self._cgroup = _own_cgroup() / f"vram-machine-{os.getpid()}"
         self._scratch = Path(tempfile.mkdtemp(prefix="vm"))
         self.prefix = self._scratch / "prefix"
@@ -150,6 +153,19 @@ class Machine:
         assert done.returncode == code, f"{said}\n{self.console}"
         return done.stdout
 
+    def answer(self, code: str, line: str) -> Any:
+        """Return what a Python program on the machine answers to a line, in JSON. It runs as root,
+        from the first question on."""
+        if self._answering is None:
+            self._answering = subprocess.Popen(
+                self.inside("/opt/vram-arbiter/bin/python", "-c", code),
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
+            )  # fmt: skip
+        assert self._answering.stdin is not None
+        assert self._answering.stdout is not None
+        self._answering.stdin.write(f"{line}\n")
+        return json.loads(self._answering.stdout.readline())
+
     def write(self, path: str, text: str) -> None:
         self.run("sh", "-c", f'mkdir -p "$(dirname {path})" && cat >{path}', stdin=text)
 
@@ -184,6 +200,8 @@ class Machine:
             self._process.wait(PATIENCE_S)
         if self._init is not None:
             os.close(self._init)
+        if self._answering is not None:  # ended with the machine
+            self._answering.communicate()
         self._remove_cgroup(time.monotonic() + PATIENCE_S)
         shutil.rmtree(self._scratch)
 

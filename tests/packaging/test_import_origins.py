@@ -149,10 +149,7 @@ print(json.dumps([
     ("program", "arguments", "code"),
     [
         pytest.param(
-            "runner",
-            ["deploy", "--config", "so101-twin", "--dry-run"],
-            0,
-            marks=pytest.mark.heavy,
+            "runner", ["deploy", "--config", "so101-twin", "--dry-run"], 0, marks=pytest.mark.heavy
         ),
         ("sidecars", ["--rskill", "owlv2-base", "--name", "eye", "--device", "none", "--check"], 2),
     ],

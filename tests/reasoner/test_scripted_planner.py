@@ -486,10 +486,7 @@ def test_a_name_that_the_detector_confirms_rules_the_place_out() -> None:
     """What the scene VLM calls a ball, and the detector too, is no cube, whatever the detector
     gives it as one: the next place is the better one.
     """
-    scores = {
-        "red cube": [(0.33, 0.1, 0.6), (0.33, -0.1, 0.5)],
-        "red ball": [(0.33, 0.11, 0.8)],
-    }
+    scores = {"red cube": [(0.33, 0.1, 0.6), (0.33, -0.1, 0.5)], "red ball": [(0.33, 0.11, 0.8)]}
     table = Table(scores, {0.1: "red ball", -0.1: "red cube"})
     result, calls = run_script(table, WITH_PLACE)
     assert grasped_at(calls) == [0.1, -0.1]
@@ -521,10 +518,7 @@ def test_a_place_that_was_seen_from_afar_is_not_forgotten() -> None:
                 self.scores["red cube"] = self.scores["red cube"][:1]
             return super().__call__(call, before)
 
-    scores = {
-        "red cube": [(0.33, 0.1, 0.6), (0.33, -0.4, 0.5)],
-        "red ball": [(0.33, 0.1, 0.8)],
-    }
+    scores = {"red cube": [(0.33, 0.1, 0.6), (0.33, -0.4, 0.5)], "red ball": [(0.33, 0.1, 0.8)]}
     table = Near(scores, {0.1: "red ball", -0.4: "red cube"})
     result, calls = run_script(table, WITH_PLACE)
     assert grasped_at(calls) == [0.1, -0.4]
@@ -552,10 +546,7 @@ def test_without_odometry_nothing_is_doubted_or_remembered() -> None:
 def test_a_doubted_place_comes_after_the_others() -> None:
     """The detector may be wrong as well: in the demo's seed 57 it preferred an orange ball to the
     orange cube, by either name, and the ball that was grasped again counted as the cube."""
-    scores = {
-        "red cube": [(0.33, 0.1, 0.64), (0.33, -0.1, 0.42)],
-        "red ball": [(0.33, 0.1, 0.45)],
-    }
+    scores = {"red cube": [(0.33, 0.1, 0.64), (0.33, -0.1, 0.42)], "red ball": [(0.33, 0.1, 0.45)]}
     for other, places, attempts in (
         ("red cube", [0.1, -0.1], 2),
         ("red cone", [0.1, -0.1, 0.1], 3),

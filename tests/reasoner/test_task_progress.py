@@ -121,10 +121,7 @@ PALETTE = Palette((Skill("lab/grab", "vla", "", ("grasp",)),), can_judge=True)
 
 
 def ask_tool(
-    a_runner: Any,
-    a_sidecar: Any,
-    prepare: Callable[[Any, Any], None],
-    call: ToolCall = ASK,
+    a_runner: Any, a_sidecar: Any, prepare: Callable[[Any, Any], None], call: ToolCall = ASK
 ) -> Any:
     """The outcome, and what the sidecar was asked."""
 

@@ -14,12 +14,7 @@ from vram_arbiter.schemas import yamltext
 from vram_arbiter.schemas.config.arbiter import load_config
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import ManifestError, parse_manifest
-from vram_arbiter.schemas.yamltext import (
-    DEPTH_MAX,
-    TEXT_MAX_BYTES,
-    parse_yaml,
-    read_yaml,
-)
+from vram_arbiter.schemas.yamltext import DEPTH_MAX, TEXT_MAX_BYTES, parse_yaml, read_yaml
 
 ROOT = Path(__file__).parents[2]
 DEEP_BY_ALIASES = "a: &a " + "[" * 40 + "]" * 40 + "\nb: " + "[" * 40 + "*a" + "]" * 40

@@ -142,12 +142,7 @@ def forged_identity(path: str, end_s: float) -> None:
 def unknown_keys(path: str, end_s: float) -> None:
     """Requests of a mebibyte of keys that mean nothing."""
     keys = {f"{number:x}": 0 for number in range(110_000)}
-    _pour(
-        path,
-        end_s,
-        _hello,
-        cycle([encode(msgpack.packb({"op": "status", "id": 2, **keys}))]),
-    )
+    _pour(path, end_s, _hello, cycle([encode(msgpack.packb({"op": "status", "id": 2, **keys}))]))
 
 
 def empty_maps(path: str, end_s: float) -> None:

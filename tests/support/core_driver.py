@@ -49,15 +49,7 @@ from vram_arbiter.arbiter.host.records import records_of
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.codec import from_map, to_map
-from vram_arbiter.schemas.ids import (
-    ClientId,
-    GpuId,
-    LeaseId,
-    ProcessKey,
-    RequestId,
-    Token,
-    UseId,
-)
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.replies import AcquireReply

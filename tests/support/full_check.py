@@ -108,9 +108,9 @@ def ledger_disagrees(ledger: GpuLedger) -> str:
 
 def residents_disagree(residents: Residents) -> str:
     """Return where the tables and the leases of a GPU disagree, "" if nowhere."""
-    for state, table in residents.by_state.items():
-        if table.keys() != {lease.id for lease in residents.values() if lease.state is state}:
-            return f"{sorted(table)} are listed as {state}"
+    listed = {(lease, state) for state, table in residents.by_state.items() for lease in table}
+    if odd := listed ^ {(lease.id, lease.state) for lease in residents.values()}:
+        return f"{sorted(odd)}: states are listed otherwise than they are"
     exclusive = {lease.id for lease in residents.values() if lease.spec.exclusive}
     if residents.exclusive.keys() != exclusive:
         return f"{sorted(residents.exclusive)} are listed as exclusive"

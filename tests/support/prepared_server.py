@@ -33,11 +33,7 @@ class _Server:
     def serve(self) -> Order | None:
         """Return the order in the child, None when the last client has gone."""
         while True:
-            waited: list[socket.socket | int] = [
-                self._listener,
-                *self._clients,
-                *self._running,
-            ]
+            waited: list[socket.socket | int] = [self._listener, *self._clients, *self._running]
             found = select.select(waited, [], [], None if self._clients else PATIENCE_S)[0]
             if not found and not self._clients:
                 return None

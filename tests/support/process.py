@@ -30,8 +30,8 @@ class ArbiterProcess:
 
     The folder is short (a socket path holds 107 bytes) and holds `arbiter.sock`, `state/`, the
     simulated GPU `fakegpu/` and `arbiter.log`. `environ` is what clients need to find it.
-    `prepared`: fork the daemon from an interpreter that has imported it, unless it is started with
-    variables or a program of its own.
+    `prepared`: fork the daemon from an interpreter that has imported it, unless it is started with a
+    program of its own.
     """
 
     def __init__(
@@ -105,8 +105,8 @@ class ArbiterProcess:
             **(extra_environ or {}),
         }
         with (self.runtime / "arbiter.log").open("ab") as log:
-            if self._prepared and not extra_environ and self.program == list(PROGRAM):
-                given = self.command()[len(PROGRAM) :]
+            program, given = self.command()[: len(PROGRAM)], self.command()[len(PROGRAM) :]
+            if self._prepared and program == list(PROGRAM):
                 self.process = start("vram-arbiter", given, environ, log.fileno(), log.fileno())
                 return self.process
             self.process = subprocess.Popen(

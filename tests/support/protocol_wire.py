@@ -163,12 +163,7 @@ def evict(
     link: Wire, record: r.LeaseRecord, asleep: str = "standby", then: str | None = None
 ) -> None:
     """The holder is asked, lets go, and hears how the lease waits."""
-    link.push(
-        "revoke",
-        lease_id=record.lease_id,
-        token=list(record.token),
-        park=True,
-    )
+    link.push("revoke", lease_id=record.lease_id, token=list(record.token), park=True)
     link.holdings.release(record, False, link.now, 5.0, asleep=asleep)
     message = link.one("release")
     assert message["parked"] == (asleep == "parked")

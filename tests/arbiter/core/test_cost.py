@@ -12,15 +12,7 @@ from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect, Reply
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.ids import (
-    ClientId,
-    GpuId,
-    LeaseId,
-    ProcessKey,
-    RequestId,
-    Token,
-    UseId,
-)
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.replies import AcquireReply
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec

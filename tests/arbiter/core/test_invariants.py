@@ -233,7 +233,7 @@ def waiters_off(b: Broken) -> None:
         (sum_off, "the sums are"),
         (account_off, "is charged"),
         (approved_off, "and approved"),
-        (state_off, "listed as held"),
+        (state_off, "states are listed otherwise"),
         (exclusive_off, "listed as exclusive"),
     ],
 )

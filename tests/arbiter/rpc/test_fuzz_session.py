@@ -78,14 +78,7 @@ class RealCore:
         self.device = SimDevice(GPU, 8 * d.GIB)
         self.arbiter = Arbiter(Settings(epoch=1, gpus=(info,)), self.plant.now)
         self.executor = Executor(
-            self.plant,
-            self,
-            self,
-            self._sample,
-            self.post,
-            lambda event: None,
-            self._signal,
-            words,
+            self.plant, self, self, self._sample, self.post, lambda event: None, self._signal, words
         )
         self._queue: deque[ev.Event] = deque()
         self._busy = False
@@ -182,11 +175,7 @@ class Plant:
         return getattr(self.table, name)
 
     def _read(
-        self,
-        after: int,
-        limit: int,
-        kinds: tuple[str, ...],
-        done: Callable[[HistoryReply], None],
+        self, after: int, limit: int, kinds: tuple[str, ...], done: Callable[[HistoryReply], None]
     ) -> None:
         done(NO_EVENTS)
 

@@ -11,11 +11,7 @@ from typing import Protocol
 
 from tests.bench.policies.outcome import Tally
 from tests.bench.policies.scenarios import Job, Plan
-from vram_arbiter.arbiter.core.events import (
-    Asked,
-    ClientConnected,
-    Event,
-)
+from vram_arbiter.arbiter.core.events import Asked, ClientConnected, Event
 from vram_arbiter.schemas.ids import ClientId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.pushes import (

@@ -33,13 +33,7 @@ from tests.bench.policies.scenarios import SCENARIOS, Scenario
 from tests.bench.policies.simulator import World
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect, Note, Push, Refuse, Reply, Sample
-from vram_arbiter.arbiter.core.events import (
-    Asked,
-    ClientConnected,
-    Event,
-    MemorySampled,
-    Tick,
-)
+from vram_arbiter.arbiter.core.events import Asked, ClientConnected, Event, MemorySampled, Tick
 from vram_arbiter.arbiter.core.model.refusals import Revoked, TooLarge
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.schemas.ids import ClientId, LeaseId, Token

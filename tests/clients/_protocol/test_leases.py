@@ -5,12 +5,7 @@ import pytest
 from tests.support.protocol_wire import Wire, view
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.connection import HELLO_TIMEOUT_S
-from vram_arbiter.schemas.errors import (
-    BadState,
-    LeaseExpired,
-    LeaseLost,
-    StaleToken,
-)
+from vram_arbiter.schemas.errors import BadState, LeaseExpired, LeaseLost, StaleToken
 from vram_arbiter.schemas.wire.requests import Unloading
 
 

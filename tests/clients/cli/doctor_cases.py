@@ -11,13 +11,7 @@ from vram_arbiter.schemas.errors import ArbiterUnreachable, UntrustedServer
 from vram_arbiter.schemas.wire.codes import Block
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.replies import StatusReply
-from vram_arbiter.schemas.wire.views import (
-    BlockView,
-    GpuView,
-    HostRamView,
-    ProcessView,
-    Totals,
-)
+from vram_arbiter.schemas.wire.views import BlockView, GpuView, HostRamView, ProcessView, Totals
 
 PID, UID, OTHER = 700, 4242, 4243
 SOCKET = "/run/vram-arbiter/arbiter.sock"

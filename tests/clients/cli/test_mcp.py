@@ -22,13 +22,17 @@ from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.wire.replies import HistoryReply, StatusReply
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
-mcp = pytest.importorskip("mcp", reason="the extra `mcp`")
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.anyio]
 
 NOBODY = 65534
 READS = {"status", "why", "history"}
 Make = Callable[..., ArbiterProcess]
 Spec = Callable[..., LeaseSpec]
+
+
+def sdk() -> Any:
+    """Return the SDK. Importing it takes 1 s of a core: not for every worker that collects this."""
+    return pytest.importorskip("mcp", reason="the extra `mcp`")
 
 
 @asynccontextmanager
@@ -42,6 +46,7 @@ async def over_stdio(arbiter: ArbiterProcess, *words: str) -> AsyncIterator[Any]
         may = ("--inh-caps=+dac_override", "--ambient-caps=+dac_override")
         user = (f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", *may)
         command = [setpriv, *user, *command]
+    mcp = sdk()
     parameters = mcp.StdioServerParameters(
         command=command[0], args=command[1:], env={**arbiter.environ, "HOME": "/"}
     )
@@ -116,7 +121,7 @@ async def test_an_operators_agent_acts_where_it_is_allowed(
 ) -> None:
     with Holder("t", endpoint=arbiter_daemon.endpoint) as holder:
         holder.acquire(spec("detector", 5)).ready()
-        async with mcp.Client(server(arbiter_daemon.endpoint, ["evict", "drain"])) as client:
+        async with sdk().Client(server(arbiter_daemon.endpoint, ["evict", "drain"])) as client:
             drained = await client.call_tool("drain", {"reason": "new driver"})
             assert "new driver" in drained.structured_content["drained"]
             assert (await client.call_tool("resume")).structured_content["drained"] == ""
@@ -130,7 +135,7 @@ async def test_an_operators_agent_acts_where_it_is_allowed(
 
 
 async def test_nothing_is_allowed_unless_it_is_named() -> None:
-    async with mcp.Client(server("ipc:///nowhere/s", [])) as client:
+    async with sdk().Client(server("ipc:///nowhere/s", [])) as client:
         assert {tool.name for tool in (await client.list_tools()).tools} == READS
         assert "Actions offered: none" in client.instructions
         refused = await client.call_tool("evict", {"target": "a", "reason": "b"})

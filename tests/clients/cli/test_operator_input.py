@@ -124,11 +124,7 @@ def test_1_for_what_cannot_be_done(
         for command in (("evict", "x", "-r", "y"), ("pin", "twin", "-r", "y"), ("unpin", "det"))
         for done in (vramctl(*command, "--json", environ=environ),)
     }  # fmt: skip
-    assert list(codes.values()) == [
-        (1, "unknown_lease"),
-        (1, "bad_request"),
-        (1, "bad_state"),
-    ]
+    assert list(codes.values()) == [(1, "unknown_lease"), (1, "bad_request"), (1, "bad_state")]
     nobody = vramctl("why", "nobody", environ=environ)
     assert (nobody.returncode, nobody.stdout.count("\n")) == (1, 1)
     assert "`vramctl history -c nobody`" in nobody.stdout

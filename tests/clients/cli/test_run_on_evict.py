@@ -134,9 +134,7 @@ def test_a_stopped_program_is_started_again(
     until(lambda: [lease.consumer for lease in client.status().leases] == ["b"])
 
 
-def test_a_stopped_program_that_ends_by_itself_ends_vramctl(
-    arbiter_daemon: ArbiterProcess,
-) -> None:
+def test_a_stopped_program_that_ends_by_itself_ends_vramctl(arbiter_daemon: ArbiterProcess) -> None:
     done = vramctl(
         "run", "--vram", "1GiB", "--on-evict", "stop", "sh", "-c", "exit 6",
         environ=arbiter_daemon.environ,

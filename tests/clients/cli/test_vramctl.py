@@ -62,15 +62,7 @@ def test_errors_are_json_where_json_was_asked_for(nowhere: dict[str, str]) -> No
 def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) -> None:
     done = vramctl("--help", environ=nowhere)
     assert done.returncode == 0
-    for word in (
-        "status",
-        "why",
-        "history",
-        "run",
-        "doctor",
-        "demo",
-        "Exit codes: 0 done",
-    ):
+    for word in ("status", "why", "history", "run", "doctor", "demo", "Exit codes: 0 done"):
         assert word in done.stdout
 
 
@@ -236,9 +228,7 @@ def test_an_operators_actions(client: Client, arbiter_daemon: ArbiterProcess, sp
 
 
 @pytest.mark.e2e
-def test_doctor_fails_on_a_drained_daemon(
-    make_arbiter: Callable[..., ArbiterProcess],
-) -> None:
+def test_doctor_fails_on_a_drained_daemon(make_arbiter: Callable[..., ArbiterProcess]) -> None:
     """It grants nothing, and doctor exited 0."""
     arbiter = make_arbiter().start()
     assert vramctl("drain", "-r", "service", environ=arbiter.environ).returncode == 0

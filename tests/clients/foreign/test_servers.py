@@ -52,9 +52,7 @@ def test_a_server_is_freed_by_its_own_api(name: str, model_server: ModelServer) 
     assert model_server.heard == ([("POST /wake_up", None)] if name == "vllm" else [])
 
 
-def test_requests_in_progress_are_counted_where_the_server_tells(
-    model_server: ModelServer,
-) -> None:
+def test_requests_in_progress_are_counted_where_the_server_tells(model_server: ModelServer) -> None:
     for name, counts in {"vllm": [3], "llama.cpp": [1, 0], "comfyui": [2]}.items():
         server = SERVERS[name](model_server.url, LIMIT_S)
         model_server.busy = list(counts)

@@ -92,16 +92,7 @@ async def ask_reasoner(endpoint: str) -> None:
     await send(endpoint, {"op": "say", "text": "stop"})
 
 
-@pytest.mark.parametrize(
-    "ask",
-    [
-        ask_arbiter,
-        ask_runner,
-        stop_runner,
-        ask_sidecar,
-        ask_reasoner,
-    ],
-)
+@pytest.mark.parametrize("ask", [ask_arbiter, ask_runner, stop_runner, ask_sidecar, ask_reasoner])
 def test_nothing_is_said_to_a_false_server(
     ask: Callable[[str], object], short_folder: Path
 ) -> None:

@@ -51,10 +51,7 @@ def start_runner(tmp_path: Path) -> Iterator[Callable[..., Forked]]:
 @pytest.mark.e2e
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it_in_order_and_the_video_is_whole(
-    start_runner: Callable[..., Forked],
-    tmp_path: Path,
-    run_async: Run,
-    how: signal.Signals,
+    start_runner: Callable[..., Forked], tmp_path: Path, run_async: Run, how: signal.Signals
 ) -> None:
     import imageio_ffmpeg
 

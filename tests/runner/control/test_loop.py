@@ -102,11 +102,7 @@ class Thinker:
 
 
 def scripted(
-    clock: Any,
-    decide_s: list[float],
-    apply_s: float = 0.0,
-    loop_clock: Any = None,
-    **options: Any,
+    clock: Any, decide_s: list[float], apply_s: float = 0.0, loop_clock: Any = None, **options: Any
 ) -> tuple[ControlLoop[Desk], Thinker]:
     """Return a loop whose skill decides as slowly as the script says."""
     loop = ControlLoop(Desk(clock, apply_s), clock=loop_clock or clock, **options)

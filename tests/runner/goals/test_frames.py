@@ -27,10 +27,7 @@ async def test_the_first_camera_is_the_default(make_runner: Make) -> None:
 
     runner = make_runner(rate_hz=200.0, cameras=("front", "wrist"))
     async with ControlThread(runner) as control:
-        for camera, encoding, magic in (
-            ("", "png", b"\x89PNG"),
-            ("wrist", "jpeg", b"\xff\xd8"),
-        ):
+        for camera, encoding, magic in (("", "png", b"\x89PNG"), ("wrist", "jpeg", b"\xff\xd8")):
             reply = await frames.fetch(control, SystemClock(), camera, 60_000.0, encoding)
             assert reply["camera"] == (camera or "front")
             assert reply["data"].startswith(magic)

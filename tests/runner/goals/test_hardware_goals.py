@@ -84,21 +84,12 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
             joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints
         }
         runner = hardware_runner(
-            twin,
-            [(camera, 100.0)],
-            lambda _: JointRanges(limits),
-            rate_hz=200.0,
-            clock=clock,
+            twin, [(camera, 100.0)], lambda _: JointRanges(limits), rate_hz=200.0, clock=clock
         )
         catalogue = Catalogue([skill.manifest], {Kind.ROS_ACTION: lambda manifest: skill})
         async with ControlThread(runner) as control:
             server = GoalServer(
-                endpoint,
-                control,
-                catalogue,
-                clock,
-                identity={"robot": "bench"},
-                estop_s=estop_s,
+                endpoint, control, catalogue, clock, identity={"robot": "bench"}, estop_s=estop_s
             )
             task = asyncio.create_task(server.serve())
             await server.bound.wait()
@@ -115,9 +106,7 @@ def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
 
 
 @pytest.fixture
-async def serving(
-    bench: Callable[..., Any],
-) -> AsyncIterator[tuple[Bench, RunnerClient]]:
+async def serving(bench: Callable[..., Any]) -> AsyncIterator[tuple[Bench, RunnerClient]]:
     async with bench() as made:
         yield made
 

@@ -430,29 +430,16 @@ def test_envelopes_only_tighten() -> None:
         ({"max_joint_speed_factor": float("nan")}, "max_joint_speed_factor", "above 0"),
         ({"max_force_n": 0.0}, "max_force_n", "above 0"),
         ({"max_cartesian_step_m": -1.0}, "max_cartesian_step_m", "above 0"),
-        (
-            {"workspace_box_min_xyz": (0, 0, 1), "workspace_box_max_xyz": (1, 1, 0)},
-            "workspace_box_min_xyz",
-            "z 1.0 > 0.0",
-        ),
-        ({"no_go_zones": ({"around": "table"},)}, "no_go_zones[0]", "center_xyz"),
-        (
-            {"no_go_zones": ({"min_xyz": (0, 0, float("nan")), "max_xyz": (1, 1, 1)},)},
-            "no_go_zones[0]",
-            "min_xyz",
-        ),
-        (
-            {"no_go_zones": ({"min_xyz": (0, 1, 0), "max_xyz": (1, 0, 1)},)},
-            "no_go_zones[0]",
-            "must be below",
-        ),
-        (
-            {"no_go_zones": ({"min_xyz": (0, 0, 0), "max_xyz": (1, 1, 0)},)},
-            "no_go_zones[0]",
-            "must be below",
-        ),
+        ({"workspace_box_min_xyz": (0, 0, 1), "workspace_box_max_xyz": (1, 1, 0)},
+         "workspace_box_min_xyz", "z 1.0 > 0.0"),
+        *(({"no_go_zones": (zone,)}, "no_go_zones[0]", told) for zone, told in (
+            ({"around": "table"}, "center_xyz"),
+            ({"min_xyz": (0, 0, float("nan")), "max_xyz": (1, 1, 1)}, "min_xyz"),
+            ({"min_xyz": (0, 1, 0), "max_xyz": (1, 0, 1)}, "must be below"),
+            ({"min_xyz": (0, 0, 0), "max_xyz": (1, 1, 0)}, "must be below"),
+        )),
     ],
-)
+)  # fmt: skip
 def test_an_envelope_that_limits_nothing_is_refused(envelope: Any, field: str, said: str) -> None:
     """Regression: a no-go zone with exchanged corners has no inside, so it kept nothing out."""
     with pytest.raises(ConfigError) as caught:

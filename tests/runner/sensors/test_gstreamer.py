@@ -94,8 +94,7 @@ class Recorder:
 
 # -- pictures
 @pytest.mark.parametrize(
-    ("encoding", "pixel"),
-    [("bgr8", b"\x00\x00\xff"), ("rgb8", b"\xff\x00\x00")],
+    ("encoding", "pixel"), [("bgr8", b"\x00\x00\xff"), ("rgb8", b"\xff\x00\x00")]
 )
 @pytest.mark.parametrize("width", [64, 101, 102, 103])
 def test_colours_and_rows(

@@ -442,10 +442,7 @@ def test_a_pinned_checkpoint_is_played_from_its_own_folder(tmp_path: Path, pinne
 @pytest.mark.nightly  # its program imports torch and lerobot once more
 @pytest.mark.timeout(600)
 def test_lerobot_eval_plays_a_checkpoint_in_an_environment_of_lerobot(
-    tmp_path: Path,
-    pinned: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    tmp_path: Path, pinned: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """lerobot's own program, with an environment and a small policy that it knows by a plugin."""
     pytest.importorskip("lerobot.policies", reason="needs the sidecars extra")

@@ -12,11 +12,7 @@ import numpy as np
 from tests.support.tabletop import NAMES
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
-from vram_arbiter.runner.sim.config import (
-    ARM_JOINTS,
-    REST_POSE,
-    SceneConfig,
-)
+from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
 from vram_arbiter.runner.sim.env import SimEnv
 from vram_arbiter.runner.sim.layout import make_layout
 from vram_arbiter.runner.sim.navigate import standoff_pose

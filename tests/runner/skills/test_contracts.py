@@ -400,11 +400,7 @@ class Answers:
 
 
 def run_goal(
-    panda: Bench,
-    run_async: Callable[[Any], Any],
-    client: Any,
-    manifest: RSkillManifest,
-    ticks: int,
+    panda: Bench, run_async: Callable[[Any], Any], client: Any, manifest: RSkillManifest, ticks: int
 ) -> list[SkillEnded]:
     """Loop, skill, gate and twin as `vram-runner deploy` composes them."""
     wiring = wire_up(manifest, panda.robot, panda.robot.rest_pose_rad)
@@ -574,39 +570,6 @@ def test_a_state_of_parts_in_the_given_units_and_orientation(panda: Bench) -> No
         wiring.state.vector(world.model_copy(update={"joint_state": bare}), measured, wiring.model)
 
 
-@pytest.mark.parametrize("rotation", Rotation)
-@pytest.mark.parametrize(
-    "vector", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.9), (3.1, 0.1, 0.0), (-3.1, 0.2, 0.1), (0, 1.6, 1.6)]
-)
-def test_orientations_survive_a_round_trip(
-    rotation: Rotation, vector: tuple[float, float, float]
-) -> None:
-    matrix = turn(vector)
-    written = numbers(matrix, rotation)
-    assert len(written) == rotation.width
-    assert matrix_of(written, rotation) == pytest.approx(matrix, abs=1e-9)
-
-
-def test_a_gripper_that_points_down_has_a_steady_axis_and_angle() -> None:
-    """LIBERO's grippers stand half a turn off: an axis that flips there is another state."""
-    angles = [numbers(turn((math.pi + by, 0.0, 0.0)), Rotation.AXIS_ANGLE)[0] for by in (-0.1, 0.1)]
-    assert angles == pytest.approx([math.pi - 0.1, math.pi + 0.1])
-
-
-@pytest.mark.parametrize(
-    ("values", "rotation", "said"),
-    [
-        ((0.0, 0.0, 0.0, 0.0), Rotation.QUAT_XYZW, "a quaternion has length 1"),
-        ((1.0, 0.0, 0.0, 2.0, 0.0, 0.0), Rotation.ROT6D, "no orientation"),
-    ],
-)
-def test_numbers_that_are_no_orientation_are_a_model_error(
-    values: tuple[float, ...], rotation: Rotation, said: str
-) -> None:
-    with pytest.raises(ModelError, match=said):
-        matrix_of(values, rotation)
-
-
 # -- what a robot cannot do
 def findings(manifest: RSkillManifest, robot: RobotDescription) -> list[str]:
     with pytest.raises(ManifestError) as caught:
@@ -621,113 +584,55 @@ def slots(dim: int, *lines: str, more: str = "") -> RSkillManifest:
 
 SCALE = "  cartesian_delta_scale: [1, 1, 1, 1, 1, 1]\n"
 SCALE3 = "  cartesian_delta_scale: [1, 1, 1]\n"
+DELTA = "range: [0, 2], control_mode: cartesian_delta, ee: gripper, frame:"
+BASE_JOINTS = "control_mode: joint_velocity, joint_names: [base_x, base_y, base_yaw]"
+SLOT, BINDINGS = "action_contract.slots[0]", "state_contract.bindings"
 
 
 @pytest.mark.parametrize(
     ("manifest", "said"),
     [
-        (
-            slots(3, "range: [0, 2], control_mode: body_twist, frame: base_link"),
-            ["action_contract.slots[0].control_mode: so101 has no base to drive"],
-        ),
-        (
-            slots(
-                3,
-                "range: [0, 2], control_mode: joint_velocity, "
-                "joint_names: [base_x, base_y, base_yaw]",
-            ),
-            [
-                "action_contract.slots[0].joint_names: drives a base (base_x, base_y, base_yaw);"
-                " so101 has none"
-            ],
-        ),
-        (
-            slots(1, "range: [0, 0], control_mode: joint_position, joint_names: [waist]"),
-            [
-                "action_contract.slots[0]: moves waist; the robot has shoulder_pan, shoulder_lift,"
-                " elbow_flex, wrist_flex, wrist_roll, gripper"
-            ],
-        ),
-        (
-            slots(6, "range: [0, 5], control_mode: joint_torque"),
-            [
-                "action_contract.slots[0].control_mode: joint_torque cannot be sent: so101 is"
-                " driven by joint positions"
-            ],
-        ),
-        (
-            slots(
-                3,
-                "range: [0, 2], control_mode: cartesian_delta, ee: gripper, frame: odom",
-                more=SCALE3,
-            ),
-            ["action_contract.slots[0].frame: no frame 'odom'; the model has "],
-        ),
-        (
-            slots(3, "range: [0, 2], control_mode: cartesian_delta, ee: gripper, frame: base"),
-            ["action_contract.cartesian_delta_scale: is not stated, and a unit of the delta may"],
-        ),
-        (
-            slots(
-                6,
-                "range: [0, 5], control_mode: cartesian_delta, ee: gripper, frame: base",
-                more=SCALE,
-            ),
-            [
-                "action_contract.slots[0]: cartesian_delta of 6 degrees of freedom; the 5 joints"
-                " that move grasp cannot follow it"
-            ],
-        ),
-        (
-            slots(
-                4,
-                "range: [0, 2], control_mode: cartesian_delta, ee: gripper, frame: base",
-                "range: [3, 3], control_mode: joint_position, joint_names: [elbow_flex]",
-                more=SCALE3,
-            ),
-            ["action_contract.slots[1]: commands elbow_flex a second time"],
-        ),
-        (
-            slots(
-                2,
-                "range: [0, 0], control_mode: gripper_position, ee: gripper",
-                "range: [1, 1], control_mode: gripper_position, ee: left_hand,"
-                " gripper_convention: percent_open",
-            ),
-            [
-                "action_contract.slots[0]: gripper_position does not say which number is open",
-                "action_contract.slots[1].ee: no end effector 'left_hand'; the robot has gripper",
-            ],
-        ),
-        (
-            slots(7, "range: [0, 6], control_mode: joint_position"),
-            ["action_contract.slots[0].range: covers 7 values for 6 joints"],
-        ),
-        (
-            skill(JOINTS + "action_contract: {dim: 7}\nstate_contract: {dim: 9}\n"),
-            [
-                "action_contract.dim: commands 7 joints, the robot has 6",
-                "state_contract.dim: is 9; this robot's state has 6 values",
-            ],
-        ),
-        (
-            skill(JOINTS + "state_contract: {layout: aloha_42d}\n"),
-            ["state_contract.layout: 'aloha_42d' is unknown here"],
-        ),
-        (
-            skill(
-                JOINTS + "state_contract: {layout: human300_16d, bindings: {eef_frame:"
-                " panda_hand_tcp, base_frame: base_link, gripper_qpos_joints: [panda_gripper]}}\n"
-            ),
-            [
-                "state_contract.bindings: no frame 'panda_hand_tcp'; the model has",
-                "state_contract.bindings: no frame 'base_link'; the model has",
-                "state_contract.bindings: asks for the state of a base; so101 has none",
-                "state_contract.bindings.gripper_qpos_joints: reads panda_gripper; the robot has",
-            ],
-        ),
+        (slots(3, "range: [0, 2], control_mode: body_twist, frame: base_link"),
+         [f"{SLOT}.control_mode: so101 has no base to drive"]),
+        (slots(3, f"range: [0, 2], {BASE_JOINTS}"),
+         [f"{SLOT}.joint_names: drives a base (base_x, base_y, base_yaw); so101 has none"]),
+        (slots(1, "range: [0, 0], control_mode: joint_position, joint_names: [waist]"),
+         [f"{SLOT}: moves waist; the robot has shoulder_pan, shoulder_lift, elbow_flex, "
+          "wrist_flex, wrist_roll, gripper"]),
+        (slots(6, "range: [0, 5], control_mode: joint_torque"),
+         [f"{SLOT}.control_mode: joint_torque cannot be sent: so101 is driven by joint positions"]),
+        (slots(3, f"{DELTA} odom", more=SCALE3),
+         [f"{SLOT}.frame: no frame 'odom'; the model has "]),
+        (slots(3, f"{DELTA} base"),
+         ["action_contract.cartesian_delta_scale: is not stated, and a unit of the delta may"]),
+        (slots(6, "range: [0, 5], control_mode: cartesian_delta, ee: gripper, frame: base",
+               more=SCALE),
+         [f"{SLOT}: cartesian_delta of 6 degrees of freedom; the 5 joints that move grasp cannot "
+          "follow it"]),
+        (slots(4, f"{DELTA} base",
+               "range: [3, 3], control_mode: joint_position, joint_names: [elbow_flex]",
+               more=SCALE3),
+         ["action_contract.slots[1]: commands elbow_flex a second time"]),
+        (slots(2, "range: [0, 0], control_mode: gripper_position, ee: gripper",
+               "range: [1, 1], control_mode: gripper_position, ee: left_hand,"
+               " gripper_convention: percent_open"),
+         [f"{SLOT}: gripper_position does not say which number is open",
+          "action_contract.slots[1].ee: no end effector 'left_hand'; the robot has gripper"]),
+        (slots(7, "range: [0, 6], control_mode: joint_position"),
+         [f"{SLOT}.range: covers 7 values for 6 joints"]),
+        (skill(JOINTS + "action_contract: {dim: 7}\nstate_contract: {dim: 9}\n"),
+         ["action_contract.dim: commands 7 joints, the robot has 6",
+          "state_contract.dim: is 9; this robot's state has 6 values"]),
+        (skill(JOINTS + "state_contract: {layout: aloha_42d}\n"),
+         ["state_contract.layout: 'aloha_42d' is unknown here"]),
+        (skill(JOINTS + "state_contract: {layout: human300_16d, bindings: {eef_frame: "
+               "panda_hand_tcp, base_frame: base_link, gripper_qpos_joints: [panda_gripper]}}\n"),
+         [f"{BINDINGS}: no frame 'panda_hand_tcp'; the model has",
+          f"{BINDINGS}: no frame 'base_link'; the model has",
+          f"{BINDINGS}: asks for the state of a base; so101 has none",
+          f"{BINDINGS}.gripper_qpos_joints: reads panda_gripper; the robot has"]),
     ],
-)
+)  # fmt: skip
 def test_each_thing_that_the_robot_cannot_do_is_a_finding(
     manifest: RSkillManifest, said: list[str]
 ) -> None:

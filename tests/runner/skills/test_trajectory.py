@@ -148,10 +148,7 @@ def test_it_is_refused_or_played_within_the_limits(
         ({}, "an empty one moves nothing"),
         (trajectory(), "an empty one moves nothing"),
         (trajectory((0.1, 0.1), names=("elbow_flex", "elbow_flex")), "named twice"),
-        (
-            trajectory((0.1,), names=("elbow",)),
-            "unknown joint elbow; the robot has shoulder_pan",
-        ),
+        (trajectory((0.1,), names=("elbow",)), "unknown joint elbow; the robot has shoulder_pan"),
         (trajectory((0.1, 0.2)), r"points\[0\]: 2 positions for 1 joints"),
         (trajectory((2.0,)), r"points\[0\]: elbow_flex 2 rad is outside"),
         (

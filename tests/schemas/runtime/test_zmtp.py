@@ -211,10 +211,7 @@ def test_a_ping_is_answered_with_its_context_and_a_pong_is_not() -> None:
     connection = greeted()
     assert events(
         connection, command_frame(b"PING", b"\x00\x64context") + command_frame(b"PONG")
-    ) == [
-        Heartbeat(),
-        Heartbeat(),
-    ]
+    ) == [Heartbeat(), Heartbeat()]
     assert connection.outgoing() == b"\x04\x0c\x04PONGcontext"
 
 

@@ -106,11 +106,7 @@ def save_wall_x(folder: Path) -> None:
     from lerobot.policies.wall_x.configuration_wall_x import WallXConfig
     from lerobot.policies.wall_x.modeling_wall_x import Qwen2_5_VLMoEForAction
     from lerobot.policies.wall_x.qwen_model import Qwen2_5_VLConfig
-    from transformers import (
-        Qwen2_5_VLProcessor,
-        Qwen2VLImageProcessor,
-        Qwen2VLVideoProcessor,
-    )
+    from transformers import Qwen2_5_VLProcessor, Qwen2VLImageProcessor, Qwen2VLVideoProcessor
 
     base = folder / "base"
     tokenizer = _qwen_tokenizer(

@@ -2,7 +2,7 @@
 read back."""
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,13 @@ def saved(
         return Weights(str(folder), local=True)
 
     return saved
+
+
+@pytest.fixture(scope="module")
+def small_networks() -> Iterator[None]:
+    """Small networks in the place of those whose sizes are fixed in lerobot's code."""
+    with policies.small_networks():
+        yield
 
 
 def placed(adapter: Any) -> Any:

@@ -175,12 +175,7 @@ def save_multi_task_dit(folder: Path) -> None:
 def save_smolvla(folder: Path) -> None:
     """Its VLM's config and processor lie beside it; SmolVLM's own processor needs num2words."""
     from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
-    from transformers import (
-        AutoTokenizer,
-        Idefics3ImageProcessor,
-        Idefics3Processor,
-        SmolVLMConfig,
-    )
+    from transformers import AutoTokenizer, Idefics3ImageProcessor, Idefics3Processor, SmolVLMConfig
 
     small = {"hidden_size": 32, "intermediate_size": 32, "num_attention_heads": 2}
     text = small | {
@@ -215,8 +210,7 @@ def save_eo1(folder: Path) -> None:
     vlm = folder / "vlm"
     tokenizer = AutoTokenizer.from_pretrained(save_tokenizer(vlm, "<|image_pad|>"))
     tokenizer.add_tokens(
-        ["<|video_pad|>", "<|vision_start|>", "<|vision_end|>"],
-        special_tokens=True,
+        ["<|video_pad|>", "<|vision_start|>", "<|vision_end|>"], special_tokens=True
     )
     template = (
         "{% for message in messages %}{% for part in message.content %}"

@@ -22,7 +22,7 @@ from vram_arbiter.sidecars.checkpoints import load_lerobot, load_transformers
 from vram_arbiter.sidecars.quantization import Nf4, nf4_layers, quantize_linear
 from vram_arbiter.sidecars.weights import Weights, read_config
 
-pytestmark = pytest.mark.heavy
+pytestmark = [pytest.mark.heavy, pytest.mark.usefixtures("small_networks")]
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 DEVICES = ("cpu", "meta")  # a load, and `vram-sidecar --check`
@@ -92,6 +92,7 @@ def load_reward(weights: Weights, device: str) -> Any:
 
 
 OTHERS: dict[str, Callable[[Path], None]] = {
+    "act": policies.save_act,
     "owlv2": tiny_vision.save_owlv2,
     "grounding_dino": tiny_vision.save_grounding_dino,
     "compact_act": shipped_copy("so101-grab"),
@@ -315,7 +316,7 @@ def refused_load(load: Callable[[Nf4 | None], Any], nf4: Nf4 | None) -> ModelErr
 
 def test_a_loader_that_swallows_what_it_could_not_read_is_found_out(tmp_path: Path) -> None:
     """lerobot's pi0.5: without weights, or with those of another model, it prints a line and
-    returns random numbers. Three billion, so without bytes."""
+    returns random numbers."""
     import torch
     from lerobot.policies.pi05.configuration_pi05 import PI05Config
     from safetensors.torch import save_file
@@ -325,7 +326,7 @@ def test_a_loader_that_swallows_what_it_could_not_read_is_found_out(tmp_path: Pa
     save_file({"another.models.weight": torch.zeros(3)}, tmp_path / WHOLE)
     error = refusal_of(load_policy, tmp_path, "meta")
     assert error.details["foreign"] == 1
-    assert error.details["missing"] > 100
+    assert error.details["missing"] > 50
 
 
 def test_check_compares_the_weights_and_ends_with_2(

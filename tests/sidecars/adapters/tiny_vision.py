@@ -349,9 +349,7 @@ def save_qwen3_5(folder: Path, **larger: Any) -> None:
     text |= larger
     vision = {"num_position_embeddings": 64, "out_hidden_size": text["hidden_size"]}
     config = Qwen3_5Config(
-        text_config=text,
-        vision_config=_QWEN_VISION | vision,
-        **_qwen_ids(tokenizer),
+        text_config=text, vision_config=_QWEN_VISION | vision, **_qwen_ids(tokenizer)
     )
     _save_vlm(Qwen3_5ForConditionalGeneration(config), tokenizer, folder)
 

@@ -1,11 +1,6 @@
 """What was measured of a model, and what of it counts for the next request."""
 
-from vram_arbiter.arbiter.core.learning import (
-    HISTORY_MAX,
-    MODELS_MAX,
-    OOM_LOADS,
-    Footprints,
-)
+from vram_arbiter.arbiter.core.learning import HISTORY_MAX, MODELS_MAX, OOM_LOADS, Footprints
 
 
 def test_few_measurements_count_by_their_maximum_and_many_by_their_95th_percentile() -> None:

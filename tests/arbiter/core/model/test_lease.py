@@ -17,10 +17,7 @@ from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 def lease(priority: int = 50, residue_bytes: int = 7) -> Lease:
     spec = LeaseSpec(
-        consumer="det",
-        model_id="m",
-        footprint=Footprint(10, 10, residue_bytes),
-        priority=priority,
+        consumer="det", model_id="m", footprint=Footprint(10, 10, residue_bytes), priority=priority
     )
     request = Request("n", 100.0, 1, 10, 10)
     return Lease(LeaseId("L1-1"), spec, ProcessKey(1, 1), ClientId("c"), request)

@@ -57,11 +57,7 @@ def test_the_last_places_are_for_requests_above_the_default_priority() -> None:
             waiting(driver.consumer(f"crowd{number}", uid=uid))
     late = driver.consumer("late", uid=9)
     assert waiting(late) == {"limit": "waiters_max", "value": 28, "share": "all"}
-    assert waiting(late, priority=51) == {
-        "limit": "waiters_max",
-        "value": 32,
-        "share": "all",
-    }
+    assert waiting(late, priority=51) == {"limit": "waiters_max", "value": 32, "share": "all"}
 
 
 def test_a_place_is_free_again_when_its_waiter_is_gone() -> None:
@@ -91,11 +87,7 @@ def test_strangers_never_take_the_uses_of_the_holder() -> None:
         raise AssertionError("nothing was refused")
 
     runner = driver.consumer("runner", uid=7)
-    assert use_all(runner) == {
-        "limit": "uses_per_lease_max",
-        "value": 4,
-        "share": "process",
-    }
+    assert use_all(runner) == {"limit": "uses_per_lease_max", "value": 4, "share": "process"}
     again = driver.consumer("again", uid=7)
     assert use_all(again)["share"] == "process"
     third = driver.consumer("third", uid=7)
@@ -103,11 +95,7 @@ def test_strangers_never_take_the_uses_of_the_holder() -> None:
     for uid in (8, 9):
         for number in range(2):
             last = use_all(driver.consumer(f"more{number}", uid=uid))
-    assert last == {
-        "limit": "uses_per_lease_max",
-        "value": 16,
-        "share": "others",
-    }
+    assert last == {"limit": "uses_per_lease_max", "value": 16, "share": "others"}
     assert use_all(holder) == {"limit": "uses_per_lease_max", "value": 16, "share": "holder"}
     answer(runner.use_begin(lease, "u0", token))
     runner.use_end(lease, "u0", token)

@@ -79,11 +79,7 @@ def test_a_holder_that_leaves_for_a_waiter_hears_of_the_operator(
     det.ack(lease, None)
     order_of(ops, "evict", lease, "maintenance")
     first, *_, last = driver.pushes("revoke", lease)
-    assert (first["priority"], first["cause"], first["wanted_by"]) == (
-        d.PRIORITY,
-        "waiter",
-        "vlm",
-    )
+    assert (first["priority"], first["cause"], first["wanted_by"]) == (d.PRIORITY, "waiter", "vlm")
     assert "priority" not in last
     assert (last["cause"], last["order"]) == ("operator", {"by": BY, "reason": "maintenance"})
 
@@ -297,8 +293,7 @@ def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
 
 @pytest.mark.parametrize("restarts", [1, 2])
 def test_who_is_given_up_and_keeps_its_bytes_has_its_lease_until_it_fences_itself(
-    driver: CoreDriver,
-    restarts: int,
+    driver: CoreDriver, restarts: int
 ) -> None:
     """A frozen process wakes up and goes on for as long as it believes in its lease; what it keeps
     until then is no mere residue."""

@@ -3,12 +3,7 @@
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.scenes import give_back, held
 from vram_arbiter.arbiter.core.effects import Note, Push, Refuse
-from vram_arbiter.arbiter.core.events import (
-    ClientConnected,
-    ClientLeft,
-    JournalFailed,
-    ProcessDied,
-)
+from vram_arbiter.arbiter.core.events import ClientConnected, ClientLeft, JournalFailed, ProcessDied
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
 

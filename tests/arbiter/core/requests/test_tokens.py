@@ -63,12 +63,7 @@ def test_nothing_that_is_said_to_others_holds_a_token() -> None:
     assert len(told) > 10
     assert {"granted", "use_began", "revoke_asked", "released"} <= {note.kind for note in notes}
     own = {str(view["token"][1]) for view in (driver.view(lease),) if view} | {str(token.serial)}
-    for effect in [
-        *told,
-        *notes,
-        driver.status(other.process),
-        driver.why("det"),
-    ]:
+    for effect in [*told, *notes, driver.status(other.process), driver.why("det")]:
         assert not any(serial in repr(effect) for serial in own), effect
 
 

@@ -32,8 +32,7 @@ def test_of_two_alike_the_one_that_reloads_faster_goes() -> None:
 
 def test_who_can_park_goes_before_who_cannot() -> None:
     driver = CoreDriver(
-        8 * GIB,
-        settings={"host_ram_budget_bytes": 16 * GIB, "learnt": {"parks": {"load_s": 40.0}}},
+        8 * GIB, settings={"host_ram_budget_bytes": 16 * GIB, "learnt": {"parks": {"load_s": 40.0}}}
     )
     _, stuck = held(driver, "stuck", 3)
     _, parks = held(driver, "parks", 3, park_bytes=3 * GIB)

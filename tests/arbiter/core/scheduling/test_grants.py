@@ -123,10 +123,7 @@ def test_an_old_reading_carries_no_grant_a_fresh_one_is_asked_for() -> None:
     again = driver.consumer("vlm").try_acquire(1 * GIB)
     assert not [e for e in again if isinstance(e, Sample)], "one is under way"
     driver.advance(0.01)
-    assert [view["state"] for view in driver.status()["leases"]] == [
-        "loading",
-        "queued",
-    ]
+    assert [view["state"] for view in driver.status()["leases"]] == ["loading", "queued"]
 
 
 def test_the_gpu_may_say_no_where_the_ledger_says_yes(driver: CoreDriver) -> None:

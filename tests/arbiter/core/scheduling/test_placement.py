@@ -131,10 +131,7 @@ def test_a_lease_that_is_away_from_a_gpu_that_is_gone_ends(two_gpus: CoreDriver)
     det.connect()
     (told,) = answer(det.reattach(lease, token, away=True))["leases"]
     assert (told["kept"], told["error"]["code"]) == (False, "lease_lost")
-    assert (two_gpus.why("det")["leases"], two_gpus.state(wanted)) == (
-        [],
-        "over",
-    )
+    assert (two_gpus.why("det")["leases"], two_gpus.state(wanted)) == ([], "over")
     _, other = held(two_gpus, "other", 5)
     assert place(two_gpus, other) == ONE, "the daemon grants"
 

@@ -55,11 +55,7 @@ def has(name: str, gib: float, *, used: bool = False, **spec: Any) -> dict[str, 
     return {"name": name, "gib": gib, "used": used, **spec}
 
 
-WEAKER = [
-    has("low", 1, priority=10),
-    has("mid", 2, priority=20),
-    has("high", 4, priority=30),
-]
+WEAKER = [has("low", 1, priority=10), has("mid", 2, priority=20), has("high", 4, priority=30)]
 VICTIMS: dict[str, tuple[list[dict[str, Any]], dict[str, Any], set[str]]] = {
     "it fits": ([has("a", 3)], {"gib": 5}, set()),
     "one that covers is better than two": (

@@ -46,8 +46,7 @@ def test_it_ends_with_its_connection(driver: CoreDriver, reason: str) -> None:
 
 @pytest.mark.parametrize("end", [Consumer.leave, Consumer.die], ids=["connection", "process"])
 def test_who_ends_during_the_measurement_does_not_want_it_back(
-    driver: CoreDriver,
-    end: Callable[[Consumer], object],
+    driver: CoreDriver, end: Callable[[Consumer], object]
 ) -> None:
     det, lease, _, wanted = revoked(driver)
     det.unload(lease)

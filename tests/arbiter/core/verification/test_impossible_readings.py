@@ -34,8 +34,7 @@ LIES: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("lie", LIES)
 def test_nothing_is_granted_on_an_impossible_reading_until_a_plausible_one(
-    driver: CoreDriver,
-    lie: dict[str, Any],
+    driver: CoreDriver, lie: dict[str, Any]
 ) -> None:
     """Regression: a changed capacity, -1 or 2^60 bytes used were believed."""
     driver.device.lies = lie

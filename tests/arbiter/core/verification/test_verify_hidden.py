@@ -23,8 +23,7 @@ def verdicts(driver: CoreDriver) -> list[tuple[str, bool]]:
 
 @pytest.mark.parametrize("since", ["always", "late"])
 def test_a_living_holder_that_nobody_lists_is_charged_for_what_it_did_not_give_back(
-    driver: CoreDriver,
-    since: str,
+    driver: CoreDriver, since: str
 ) -> None:
     """Regression: a process that the list omits counted as one without bytes, and its memory was
     granted again after ten seconds."""

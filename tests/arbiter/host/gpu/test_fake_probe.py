@@ -124,10 +124,7 @@ def test_unknown_gpus(probe, tmp_path):
 
 def test_sizes_make_gpus_in_the_runtime_folder_and_a_second_start_keeps_them(tmp_path):
     first = open_gpus("8GiB,16GiB", tmp_path)
-    assert [(gpu.index, gpu.total_bytes) for gpu in first.gpus()] == [
-        (0, 8 * GIB),
-        (1, 16 * GIB),
-    ]
+    assert [(gpu.index, gpu.total_bytes) for gpu in first.gpus()] == [(0, 8 * GIB), (1, 16 * GIB)]
     stowaway(tmp_path / "fakegpu", os.getpid(), GIB)
     again = open_gpus("8GiB,16GiB", tmp_path)
     assert again.gpus() == first.gpus()

@@ -76,10 +76,7 @@ def test_an_orin_is_read_by_what_is_available(orin: Path) -> None:
     probe, source = choose("auto", PIDS, orin, NO_DRIVER)
     assert source == "unified"
     (gpu,) = probe.gpus()
-    assert (gpu.id, gpu.name) == (
-        "UNIFIED-1423223012345",
-        "NVIDIA Jetson Orin Nano Developer Kit",
-    )
+    assert (gpu.id, gpu.name) == ("UNIFIED-1423223012345", "NVIDIA Jetson Orin Nano Developer Kit")
     reading = probe.sample(gpu.id)
     assert (reading.total_bytes, reading.used_bytes) == (
         7802124 * KIB,

@@ -5,12 +5,7 @@ from dataclasses import replace
 from tests.support.core_driver import CoreDriver
 from vram_arbiter.clients.observer.figures import GpuUsage, usage
 from vram_arbiter.clients.observer.page.messages import OTHERS, PENDING_FREE, RETAINED, STOWAWAYS
-from vram_arbiter.clients.observer.page.usage import (
-    CONSUMERS_MAX,
-    KEPT_S,
-    PARTS_MAX,
-    UsageRecord,
-)
+from vram_arbiter.clients.observer.page.usage import CONSUMERS_MAX, KEPT_S, PARTS_MAX, UsageRecord
 from vram_arbiter.schemas.defaults import GIB, MIB
 
 EMPTY = GpuUsage(0, {}, 0, 0, 0, 0)

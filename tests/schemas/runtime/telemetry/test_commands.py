@@ -141,11 +141,7 @@ def test_nobody_asked_nothing_is_imported_or_changed() -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [
-        "vramctl history",
-        "vram-reasoner --say x",
-        "vram-runner replay --dataset x --frame 0",
-    ],
+    ["vramctl history", "vram-reasoner --say x", "vram-runner replay --dataset x --frame 0"],
 )
 def test_variables_that_make_no_sense_are_told_in_one_line(
     ran: Callable[..., tuple[object, str]], words: str

@@ -102,10 +102,7 @@ OTLP_AND_PROMETHEUS = {
     ],
 )
 def test_the_environment_says_which_exporters_are_wanted(
-    environ: Mapping[str, str],
-    traces: Sequence[str],
-    metrics: Sequence[str],
-    logs: Sequence[str],
+    environ: Mapping[str, str], traces: Sequence[str], metrics: Sequence[str], logs: Sequence[str]
 ) -> None:
     assert wanted(environ) == {"traces": traces, "metrics": metrics, "logs": logs}
 
