@@ -1,4 +1,4 @@
-"""`vram-runner rosbag --dataset DIR --episode N --out BAG`: a recorded episode for ROS 2's tools."""
+"""`vram-runner rosbag --dataset DIR --episode N --out BAG`: a recorded episode for ROS 2."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def add_parser(commands: Commands) -> argparse.ArgumentParser:
 
 
 async def run(args: argparse.Namespace) -> int:
-    """Write the bag. Raises ConfigError for an unusable folder, BadRequest for a missing episode."""
+    """Write the bag. Raises ConfigError for a bad folder, BadRequest for a missing episode."""
     from vram_arbiter.runner.recording.rosbag import export
 
     count = await asyncio.to_thread(export, args.dataset, args.episode, args.out)

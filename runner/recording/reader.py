@@ -37,7 +37,8 @@ class Recorded:
     """One frame.
 
     `state` and `action` are by joint (rad); `timings_ms` by part of the tick; `pictures` maps a
-    camera to its video's path, the second in it and the picture's age (ms). The end of `goal` is that of its episode.
+    camera to its video's path, the second in it and the picture's age (ms). The end of `goal` is
+    that of its episode.
     """
 
     root: str

@@ -25,7 +25,8 @@ ACTION_TOPIC: Final = "/joint_commands"
 def export(root: Path, episode: int, out: Path) -> int:
     """Write an episode into the new folder `out`; return its number of messages.
 
-    Raises ConfigError for a folder that exists or cannot be written, and what `read_episode` raises.
+    Raises ConfigError for a folder that exists or cannot be written, and what `read_episode`
+    raises.
     """
     need("rosbag2", "rosbags", "av", "cv2", extra="ros2,dataset,runner")
     from rosbags.rosbag2 import StoragePlugin, Writer, WriterError

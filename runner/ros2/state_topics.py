@@ -36,7 +36,7 @@ KINDS: Final = {
 
 
 class StateTopics:
-    """`await StateTopics(client, 0, rate_hz=20).run()`. Raises ConfigError: DDS cannot be started."""
+    """`await StateTopics(client, 0, rate_hz=20).run()`. Raises ConfigError if DDS cannot start."""
 
     def __init__(self, client: RunnerClient, domain: int, rate_hz: float) -> None:
         from cyclonedds.domain import DomainParticipant

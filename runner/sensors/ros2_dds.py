@@ -1,5 +1,5 @@
-"""ROS 2's side of DDS: topic names, domain, readers and writers with their quality of service. Needs
-no ROS installation.
+"""ROS 2's side of DDS: topic names, domain, readers and writers with their quality of service.
+Needs no ROS installation.
 
 Cyclone DDS chooses the network: `CYCLONEDDS_URI` configures it, as for ROS with rmw_cyclonedds.
 """

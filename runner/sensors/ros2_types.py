@@ -277,7 +277,7 @@ def dds_type(kind: str) -> Any:
 
 @functools.cache
 def _struct(kind: str) -> Any:
-    """Return Cyclone's IDL type under its ROS name, `nav2_msgs::action::dds_::NavigateToPose_Goal_`."""
+    """Return Cyclone's IDL type under its ROS name, `nav2_msgs::…::NavigateToPose_Goal_`."""
     from cyclonedds.idl import make_idl_struct, types
 
     def of(base: str, count: int | None) -> Any:

@@ -180,8 +180,8 @@ def _gap_s(here: Point, there: Point) -> float:
 
 
 class FollowJointTrajectory(SkillBase):
-    """One goal, one trajectory. Fails with `goal_rejected` when the arm does not arrive in time, and
-    with `path_tolerance_violated` when a joint is too far from the target that was sent last.
+    """One goal, one trajectory. Fails with `goal_rejected` when the arm does not arrive in time,
+    and with `path_tolerance_violated` when a joint is too far from the target that was sent last.
 
     `sent` returns the targets in force (rad by joint), from which it begins; without it, and for
     joints that it does not name, it begins at the measured positions. A gripper that holds

@@ -19,7 +19,8 @@ case "${0##*/} $*" in
 id*) echo 0 ;;
 apt-cache*) echo "$2 | 1.0 | a source" ;;
 dpkg*nvidia-l4t-*) exit 1 ;;
-"uv venv"*) mkdir -p "$4/bin" && printf '#!/bin/sh\\n' >"$4/bin/python" && chmod +x "$4/bin/python" ;;
+"uv venv"*)
+    mkdir -p "$4/bin" && printf '#!/bin/sh\\n' >"$4/bin/python" && chmod +x "$4/bin/python" ;;
 "gst-inspect-1.0 --exists $LACKS") exit 1 ;;
 esac
 """

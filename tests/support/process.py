@@ -30,8 +30,8 @@ class ArbiterProcess:
 
     The folder is short (a socket path holds 107 bytes) and holds `arbiter.sock`, `state/`, the
     simulated GPU `fakegpu/` and `arbiter.log`. `environ` is what clients need to find it.
-    `prepared`: fork the daemon from an interpreter that has imported it, unless it is started with a
-    program of its own.
+    `prepared`: fork the daemon from an interpreter that has imported it, unless it is started with
+    a program of its own.
     """
 
     def __init__(

@@ -313,7 +313,8 @@ def read_bag(bag: Path) -> dict[str, list[tuple[int, str, Any]]]:
     with file.open("rb") as opened:
         reader = make_reader(opened, decoder_factories=[DecoderFactory()])
         for schema, channel, message, decoded in reader.iter_decoded_messages():
-            found[channel.topic].append((message.log_time, schema.name, decoded))  # type: ignore[union-attr]
+            assert schema is not None
+            found[channel.topic].append((message.log_time, schema.name, decoded))
     return dict(found)
 
 

@@ -54,7 +54,7 @@ TFMessage_ = struct("tf2_msgs.msg.dds_.TFMessage_", transforms=sequence[Stamped_
 
 
 class Listener:
-    """Reads a topic as ROS's listeners do: all that was sent, of /tf_static also what was before."""
+    """Reads a topic as ROS's listeners do: all that was sent, of /tf_static also before."""
 
     def __init__(self, domain: int, name: str, kind: type) -> None:
         quality = Qos(

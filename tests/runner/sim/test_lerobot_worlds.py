@@ -1,5 +1,5 @@
-"""PushT and ALOHA of the field, played by `lerobot-eval` under this runner with a checkpoint that is
-trained here. Nightly: ALOHA's pictures of 640 × 480 take seconds of a core."""
+"""PushT and ALOHA of the field, played by `lerobot-eval` under this runner with a checkpoint that
+is trained here. Nightly: ALOHA's pictures of 640 × 480 take seconds of a core."""
 
 import json
 from collections.abc import Mapping
@@ -80,7 +80,8 @@ def train(folder: Path, world: World, shown: dict[str, Any]) -> tuple[float, flo
         },
         output_features={"action": PolicyFeature(FeatureType.ACTION, tuple(actions.shape[1:]))},
         device="cpu", dim_model=32, n_heads=2, dim_feedforward=32, n_encoder_layers=1,
-        use_vae=False, dropout=0.0, chunk_size=CHUNK, n_action_steps=CHUNK, pretrained_backbone_weights=None,
+        use_vae=False, dropout=0.0, chunk_size=CHUNK, n_action_steps=CHUNK,
+        pretrained_backbone_weights=None,
     )  # fmt: skip
     stats = {
         key: {"mean": value.mean(0), "std": value.std(0) + 1e-3}
