@@ -49,7 +49,7 @@ def play(world: ArmEnvironment, seed: int) -> list[Phase]:
 
     Observations, chunks, rows and the gate are those of a goal; only the socket is left out.
     """
-    manifest = load_manifest(CONFIGS / "rskills/panda-mobile-grab/rskill.yaml")
+    manifest = load_manifest(CONFIGS / "rskills/panda-grab/rskill.yaml")
     wiring = wire_up(manifest, world.robot, world.robot.rest_pose_rad)
     env, rng, policy = world.arm, random.Random(seed), ScriptedPickAdapter(manifest)
     world.reset(seed)

@@ -23,7 +23,7 @@ CONFIGS = Path(__file__).parents[3] / "configs"
 
 @pytest.fixture
 def manifest() -> RSkillManifest:
-    return load_manifest(CONFIGS / "rskills/panda-mobile-grab/rskill.yaml")
+    return load_manifest(CONFIGS / "rskills/panda-grab/rskill.yaml")
 
 
 def observation(**more: Any) -> dict[str, Any]:
