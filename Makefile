@@ -1,6 +1,7 @@
 # Every target sets up what it needs first; see .ci/setup. `make` alone lists the targets.
 
 SEED ?= 0
+ROBOT ?= so101-mobile
 ARBITER ?= on
 GPU ?= fake:8GiB
 OUT ?= out/demo
@@ -39,8 +40,8 @@ setup-core: ## environment of the base install (.venv-core)
 jetson: ## as root on a Jetson: system packages, Cyclone DDS, NVIDIA's torch: ARGS=--dry-run
 	@bash .ci/jetson $(ARGS)
 
-demo: setup ## find, navigate, grab in 8 GiB: SEED=0 ARBITER=on|off GPU=fake:8GiB|nvml OUT=out/demo
-	$(BIN)/vramctl demo --seed $(SEED) --arbiter $(ARBITER) --gpu $(GPU) --out $(OUT) $(ARGS)
+demo: setup ## find, navigate, grab in 8 GiB: SEED=0 ROBOT=panda-mobile ARBITER=off GPU=nvml OUT=out/demo
+	$(BIN)/vramctl demo --seed $(SEED) --robot $(ROBOT) --arbiter $(ARBITER) --gpu $(GPU) --out $(OUT) $(ARGS)
 
 test: setup ## the whole product; ARGS goes to pytest
 	$(BIN)/pytest -q -n $(WORKERS) $(BY_FILE) -m "not gpu and not nightly" $(ARGS)

@@ -19,9 +19,9 @@ from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
 from vram_arbiter.sidecars.adapters import policy_families
-from vram_arbiter.sidecars.adapters.base import ModelAdapter
+from vram_arbiter.sidecars.adapters.base import ModelAdapter, has_model
 from vram_arbiter.sidecars.adapters.choose import ONNX
-from vram_arbiter.sidecars.adapters.gpu_passthrough import is_passthrough, need_gpu
+from vram_arbiter.sidecars.adapters.gpu_passthrough import need_gpu
 from vram_arbiter.sidecars.adapters.onnx_detector import providers
 from vram_arbiter.sidecars.device.capacity import capacities
 from vram_arbiter.sidecars.model_main import AdapterFor
@@ -130,7 +130,7 @@ def need_packages(manifest: RSkillManifest) -> None:
     """Raise ConfigError where the model's libraries are not installed."""
     if manifest.runtime in ONNX:
         need(f"runtime {manifest.runtime.value}", "onnxruntime", "PIL", extra="onnx")
-    elif not is_passthrough(manifest):
+    elif has_model(manifest):
         lerobot = manifest.kind in (Kind.VLA, Kind.REWARD)
         library = "lerobot" if lerobot else "transformers"
         need(f"a model of kind {manifest.kind}", "torch", library, extra="sidecars")
@@ -142,7 +142,7 @@ def need_precision(manifest: RSkillManifest, device: str) -> None:
     where ONNX Runtime cannot run it on the device."""
     if manifest.runtime in ONNX:
         providers(manifest, device)
-    elif not is_passthrough(manifest):
+    elif has_model(manifest):
         check_precision(manifest, device)
 
 
@@ -153,7 +153,7 @@ def _weights(
     whether it is here."""
     if weights is None:
         return []
-    if is_passthrough(manifest):
+    if not has_model(manifest):
         return [Finding("weights", True, "it has none")]
     if importlib.util.find_spec("huggingface_hub") is None and not weights.local:
         return [Finding("weights", None, f"{NOT_COMPARED}: the hub's package is not installed")]

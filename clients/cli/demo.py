@@ -46,15 +46,26 @@ from vram_arbiter.schemas.units import parse_bytes
 from vram_arbiter.schemas.urls import HttpAddress, http_address
 
 DESCRIPTIONS = {
-    "demo": "Run find, navigate, grab on a simulated SO-101 inside an 8 GiB GPU budget. Exits 0 if "
+    "demo": "Run find, navigate, grab on a simulated robot inside an 8 GiB GPU budget. Exits 0 if "
     "the demo shows what it promises (with the arbiter: completed without any out-of-memory, and "
     "the detector back on the GPU; without: an out-of-memory), 1 if not."
 }
 SEED_MAX = 2**31 - 1
-SIDECARS = {"detector": "so101-detector", "scene-vlm": "so101-scene-vlm", "grab": "so101-grab"}
+DETECTOR, VLM, GRAB = "detector", "scene-vlm", "grab"
+ROBOTS = {
+    "so101-mobile": {DETECTOR: "so101-detector", VLM: "so101-scene-vlm", GRAB: "so101-grab"},
+    # no scene VLM: the shipped one does not know this gripper
+    "panda-mobile": {DETECTOR: "so101-detector", GRAB: "panda-grab"},
+}
+"""Sidecars and their skills, by the robot of `vram-runner sim --robot`."""
+NOTES = {
+    "panda-mobile": "the grab is scripted: it has the contract and the footprint of "
+    "pi05-robocasa365, and no model"
+}
+CLIENTS = {DETECTOR: DetectorClient, VLM: SceneVlmClient, GRAB: PolicyClient}
 # the detector is resident between goals; the models of a goal leave when they are idle
 IDLE = ["--idle-release-s", "5"]
-RESIDENCY = {"detector": ["--standby"], "scene-vlm": IDLE, "grab": IDLE}
+RESIDENCY = {DETECTOR: ["--standby"], VLM: IDLE, GRAB: IDLE}
 BUDGET = "8GiB"
 # of the simulated GPU: a copy from ordinary host RAM over PCIe 4.0
 COPY_BYTES_PER_S = 6_000_000_000
@@ -76,6 +87,11 @@ class Episode:
     gpu: str
     out: Path
     http: HttpAddress | None = None
+    robot: str = "so101-mobile"
+
+    @property
+    def sidecars(self) -> Mapping[str, str]:
+        return ROBOTS[self.robot]
 
 
 @dataclass(slots=True)
@@ -102,6 +118,13 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         type=arguments.count(0, SEED_MAX),
         default=0,
         help="which episode: objects, places, light (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--robot",
+        choices=tuple(ROBOTS),
+        default="so101-mobile",
+        help="panda-mobile: a Panda at a kitchen counter, whose grab is scripted (default: "
+        "%(default)s)",
     )
     parser.add_argument(
         "--arbiter",
@@ -147,7 +170,7 @@ def run(args: argparse.Namespace) -> int:
     if args.quick:
         from vram_arbiter.clients.cli import demo_quick
 
-        options = ("seed", "arbiter", "gpu", "http", "out")
+        options = ("seed", "robot", "arbiter", "gpu", "http", "out")
         if any(getattr(args, name) != args.parser.get_default(name) for name in options):
             args.parser.error("--quick takes no other option")
         return demo_quick.run()
@@ -164,7 +187,7 @@ def run(args: argparse.Namespace) -> int:
     packages = ("torch", "lerobot", "transformers", "mujoco", "cv2", "matplotlib")
     need("the demo", *packages, extra="all")
     out: Path = args.out
-    summary = asyncio.run(_demo(Episode(args.seed, arbiter, args.gpu, out, args.http)))
+    summary = asyncio.run(_demo(Episode(args.seed, arbiter, args.gpu, out, args.http, args.robot)))
     print(json.dumps({key: value for key, value in summary.items() if key != "loads"}, indent=2))
     print(f"written: {out}/summary.json, {out}/timeline.png, {out}/episode.mp4")
     oom = summary["oom_events"] > 0
@@ -211,8 +234,9 @@ async def _episode(programs: Programs, runtime: Path, what: Episode) -> JsonObje
         display = Display()
         display.say(f"{task}{'' if arbiter else ', without an arbiter'}")
         result_file = out / "reasoner.json"
+        unasked = [] if VLM in what.sidecars else ["--scene-vlm", "none"]
         reasoner = await programs.start(
-            "reasoner", "reasoner", "--task", task, "--result", str(result_file.resolve())
+            "reasoner", "reasoner", "--task", task, "--result", str(result_file.resolve()), *unasked
         )
         await _watch(programs, reasoner, client, display, watch)
         truth = await runner.ground_truth()
@@ -231,6 +255,7 @@ async def _episode(programs: Programs, runtime: Path, what: Episode) -> JsonObje
         seed=what.seed, arbiter=arbiter, task=task, story=story, capacity_bytes=capacity,
         events=watch.events, reasoner=outcome, truth=truth,
         target=target, seconds=seconds, detector_resident=watch.detector_held,
+        asked_vlm=VLM in what.sidecars,
     )  # fmt: skip
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     title = (
@@ -271,9 +296,11 @@ async def boot(
     arbiter."""
     gpu, arbiter = what.gpu, what.arbiter
     print(
-        f"starting {'the arbiter, ' if arbiter else ''}three sidecars and the runner (imports take "
-        "a while) …"
+        f"starting {'the arbiter, ' if arbiter else ''}{len(what.sidecars)} sidecars and the runner "
+        "(imports take a while) …"
     )
+    if what.robot in NOTES:
+        print(f"note: {NOTES[what.robot]}")
     without = [] if arbiter else ["--no-arbiter"]
     client = None
     if arbiter:
@@ -289,7 +316,7 @@ async def boot(
         if what.http is not None:
             print(f"status page: http://{what.http}")
     device = "cuda" if gpu == "nvml" else f"fake:{runtime}/fakegpu"
-    for name, rskill in SIDECARS.items():
+    for name, rskill in what.sidecars.items():
         manifest = str(configs_folder(os.environ) / "rskills" / rskill / "rskill.yaml")
         stays = without or RESIDENCY[name]
         await programs.start(
@@ -297,14 +324,10 @@ async def boot(
         )
     video = str((what.out / "episode.mp4").resolve())
     await programs.start(
-        "runner", "runner", "sim", "--seed", str(what.seed), "--video", video, *without
-    )
-    endpoints = {name: f"ipc://{runtime}/{name}.sock" for name in SIDECARS}
-    sidecars = [
-        DetectorClient(endpoints["detector"]),
-        SceneVlmClient(endpoints["scene-vlm"]),
-        PolicyClient(endpoints["grab"]),
-    ]
+        "runner", "runner", "sim", "--robot", what.robot, "--seed", str(what.seed),
+        "--video", video, *without,
+    )  # fmt: skip
+    sidecars = [CLIENTS[name](f"ipc://{runtime}/{name}.sock") for name in what.sidecars]
     async with asyncio.timeout(BOOT_S):
         for sidecar in sidecars:
             async with sidecar:

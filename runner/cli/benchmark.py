@@ -167,7 +167,9 @@ async def _play(entry: Entry, args: argparse.Namespace, stopping: asyncio.Event)
     try:
         async with contextlib.AsyncExitStack() as stack:
             rate_hz = bench.runner.rate_hz
-            dataset = await record_sim(args, bench.runner, rate_hz, bench.stop, stack, strict=True)
+            dataset = await record_sim(
+                args, bench.runner, rate_hz, bench.stop, stack, robot="so101-mobile", strict=True
+            )
             cell = await bench.run(entry.skill(), seeds)
     finally:
         watching.cancel()

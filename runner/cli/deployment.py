@@ -165,13 +165,13 @@ def unkept(file: DeploymentFile, parts: Parts, catalogue: Catalogue) -> tuple[st
 
 
 def contracts(parts: Parts, catalogue: Catalogue) -> list[str]:
-    """Return what the policies' vectors are on this robot, and what of them changes nothing."""
+    """Return what the policies' vectors are on this robot."""
     found = []
     for manifest in catalogue.executable():
         if manifest.kind is Kind.VLA:
             wiring = wire_up(manifest, parts.hal.description, None)
             widths = f"{wiring.actions.dim} actions from a state of {wiring.state.width}"
-            found += [f"{manifest.name}: {text}" for text in (widths, *wiring.actions.notes)]
+            found.append(f"{manifest.name}: {widths}")
     return found
 
 

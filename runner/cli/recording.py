@@ -18,6 +18,7 @@ from vram_arbiter.schemas.errors import ConfigError, FrameStale, InternalError, 
 
 if TYPE_CHECKING:
     from vram_arbiter.runner.recording.recorder import DatasetRecorder
+    from vram_arbiter.runner.sim.robot import SimRunner
 
 log = logging.getLogger("runner")
 
@@ -38,11 +39,12 @@ def add_record_flags(parser: argparse.ArgumentParser, what: str) -> None:
 
 async def record_sim(
     args: argparse.Namespace,
-    runner: InferenceRunner,
+    runner: SimRunner,
     rate_hz: float,
     on_lost: Callable[[], None],
     stack: contextlib.AsyncExitStack,
     *,
+    robot: str,
     strict: bool = False,
 ) -> DatasetRecorder | None:
     """Record a simulated robot as the flags ask for, see `record_into`; None: they do not."""
@@ -50,12 +52,14 @@ async def record_sim(
         if args.record_format != "full":
             raise ConfigError("--record-format is for --record DIR")
         return None
-    from vram_arbiter.runner.robots.so101 import lerobot_units_of, so101
-    from vram_arbiter.runner.sim.worlds import ROBOT
+    from vram_arbiter.runner.robots.so101 import lerobot_units_of
 
-    units = lerobot_units_of(so101(simulated=True)) if args.record_format == "lerobot" else None
+    described = runner.robot.env.robot
+    units = lerobot_units_of(described) if args.record_format == "lerobot" else None
+    if args.record_format == "lerobot" and units is None:
+        raise ConfigError(f"--record-format lerobot: lerobot has no units of a {described.name}")
     return await record_into(
-        args.record, runner, on_lost, stack, rate_hz, ROBOT, units, strict=strict
+        args.record, runner, on_lost, stack, rate_hz, robot, units, strict=strict
     )
 
 

@@ -1,4 +1,4 @@
-"""`vram-runner sim`: run the simulated SO-101 and serve goals.
+"""`vram-runner sim`: run a simulated robot and serve goals.
 
 Composes the parts and nothing else.
 """
@@ -46,12 +46,16 @@ from vram_arbiter.schemas.runtime.extras import need
 log = logging.getLogger("runner")
 
 SERVES = True
+ROBOTS = ("so101-mobile", "panda-mobile")  # keys of `sim.worlds.WORLDS`
 
 
 def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner sim`."""
-    sim = commands.add_parser("sim", help="simulate the SO-101 on a mobile base")
-    sim.add_argument("--scene", type=Path, help="scene file; without it the built-in table")
+    sim = commands.add_parser("sim", help="simulate a robot on a mobile base")
+    sim.add_argument(
+        "--robot", choices=ROBOTS, default=ROBOTS[0], help="which robot; default %(default)s"
+    )
+    sim.add_argument("--scene", type=Path, help="scene file; without it the robot's own scene")
     sim.add_argument("--seed", type=int, default=0, help="seed of the scene")
     add_record_flags(sim, "every goal")
     add_display_flag(sim)
@@ -86,14 +90,14 @@ async def run(args: argparse.Namespace) -> int:
     from vram_arbiter.runner.goals.catalogue import Catalogue, read_manifests
     from vram_arbiter.runner.goals.server import GoalServer
     from vram_arbiter.runner.protocols import DeadlinePolicy
-    from vram_arbiter.runner.robots.body import SIMULATED
     from vram_arbiter.runner.sim.robot import VIDEO_EVERY, sim_runner
     from vram_arbiter.runner.sim.truth import truth_as_wire
     from vram_arbiter.runner.sim.video import VideoRecorder
-    from vram_arbiter.runner.sim.worlds import ROBOT, makers_of, so101_world
+    from vram_arbiter.runner.sim.worlds import WORLDS, makers_of
     from vram_arbiter.runner.skills.sidecar_policy import LOCKSTEP_WAIT_S
 
-    world = so101_world(args.scene)
+    chosen = WORLDS[args.robot]
+    world = chosen.make(args.scene)
     check_display_flag(args)
     check_output("--video", args.video)
     check_output("--timings", args.timings)
@@ -121,10 +125,10 @@ async def run(args: argparse.Namespace) -> int:
             deadline_policy=DeadlinePolicy(args.deadline_policy),
             clock=clock,
         )
-        runner.identity = {"robot": ROBOT, "scene": str(args.scene or "built-in")}
+        runner.identity = {"robot": args.robot, "scene": str(args.scene or "built-in")}
         runner.spans.share = args.trace_ticks
-        dataset = await record_sim(args, runner, args.rate, stopping.set, stack)
-        display_runner(args, runner, ROBOT, arbiter, stack)
+        dataset = await record_sim(args, runner, args.rate, stopping.set, stack, robot=args.robot)
+        display_runner(args, runner, args.robot, arbiter, stack)
         control = await stack.enter_async_context(ControlThread(runner))
         await asyncio.to_thread(warm_up)
         await ready(control)
@@ -144,7 +148,7 @@ async def run(args: argparse.Namespace) -> int:
                 manifests,
                 makers_of(world, given, arbiter, period_s=period_s, wait_s=wait_s),
                 refused=unlicensed(manifests, allow_noncommercial=args.allow_noncommercial),
-                body=SIMULATED,
+                body=chosen.body,
             ),
             clock,
             ground_truth=lambda: truth_as_wire(world.arm),

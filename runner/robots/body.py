@@ -14,6 +14,11 @@ TWINS = ("so101_mujoco", "so101_kinematic")
 LEROBOT = "lerobot:"
 KNOWN = frozenset(get_args(EmbodimentTag)) - NOT_A_ROBOT - {"custom"}
 
+PANDA_MOBILE = Body(
+    embodiment_tags=("panda_mobile", "mobile_base"),
+    capabilities={"has_vision": True, "has_gripper": True, "has_mobile_base": True},
+)
+"""The Panda on its mobile base of `vram-runner sim --robot panda-mobile`."""
 SIMULATED = Body(
     embodiment_tags=(SO101, "mobile_base"),
     capabilities={"has_vision": True, "has_gripper": True, "has_mobile_base": True},

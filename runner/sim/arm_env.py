@@ -76,6 +76,7 @@ class ArmEnvironment:
         self._in_a_row = 0
         self._targets: dict[str, float] = {}  # last joint targets, rad
         self._random = random.Random(0)
+        self._base_frame = robot.base.world_frame if robot.base is not None else "map"
         self._limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in robot.joints}
         self._gate = RobotGate(robot, rate_hz=CONTROL_HZ, kinematics=kinematics, sent=self.sent)
 
@@ -114,7 +115,7 @@ class ArmEnvironment:
                 velocity=tuple(velocities[name] for name in positions),
                 stamp_ns=stamp_ns,
             ),
-            base_pose=planar_pose(*self.arm.base_pose(), "map"),
+            base_pose=planar_pose(*self.arm.base_pose(), self._base_frame),
             image_frames=dict(frames) if frames is not None else None,
         )
 

@@ -73,8 +73,10 @@ class SceneConfig(BaseModel):
     table_edge_x_m: float = 0.62
     table_depth_m: float = 0.45
     table_width_m: float = 1.30
+    furniture: Literal["table", "counter"] = "table"
     mount_in_base_m: tuple[float, float, float] = (0.08, 0.0, 0.20)
     base_half_size_m: tuple[float, float] = (0.15, 0.14)
+    base_front_of_mount_m: float = 0.05
     grasp_spot_in_base_m: tuple[float, float] = (0.325, 0.0)
     object_count: int = Field(default=4, ge=1, le=8)
     object_spacing_m: float = 0.10

@@ -14,22 +14,13 @@ from typing import TYPE_CHECKING, Any, Self
 
 from vram_arbiter.runner.planar import drive
 from vram_arbiter.runner.sim.config import (
-    ARM_JOINTS,
     BASE_JOINTS,
     CONTROL_DT_S,
-    REST_POSE,
     SceneConfig,
     wrap_angle,
 )
 from vram_arbiter.runner.sim.layout import Layout, make_layout
-from vram_arbiter.runner.sim.scene import (
-    ARM_PREFIX,
-    FIXED_FINGER_GEOM,
-    GRASP_SITE,
-    MOVING_FINGER_GEOM,
-    build_model,
-    load_mujoco,
-)
+from vram_arbiter.runner.sim.scene import SO101, SimBody, build_model, load_mujoco
 from vram_arbiter.schemas.world import CameraModel
 
 if TYPE_CHECKING:
@@ -78,15 +69,16 @@ class SeenObject:
 
 
 class SimEnv:
-    """SO-101 on a planar base, stepped at 30 Hz.
+    """A robot on a planar base, stepped at 30 Hz.
 
-    Arm targets are six joint angles in radians in the order of `ARM_JOINTS`; base velocities are
+    Arm targets are joint positions (rad, m) in the order of `robot.joints`; base velocities are
     (vx, vy, wz) in the base's own frame, in m/s and rad/s. Call `close` (or use `with`) in the
     thread that rendered.
     """
 
-    def __init__(self, config: SceneConfig | None = None) -> None:
+    def __init__(self, config: SceneConfig | None = None, robot: SimBody = SO101) -> None:
         self.config = config or SceneConfig()
+        self.robot = robot
         self._renderers: dict[str, Renderer] = {}
         self._layout: Layout | None = None
         self._model: Any = None
@@ -102,22 +94,20 @@ class SimEnv:
 
         self.close()
         self._layout = make_layout(seed, self.config, names=names)
-        self._model = build_model(self._layout, self.config)
+        self._model = build_model(self._layout, self.config, self.robot)
         self._data = mujoco.MjData(self._model)
         self._substeps = round(CONTROL_DT_S / self.config.timestep_s)
-        self._arm_q = [int(self._model.joint(ARM_PREFIX + n).qposadr[0]) for n in ARM_JOINTS]
-        self._arm_v = [int(self._model.joint(ARM_PREFIX + n).dofadr[0]) for n in ARM_JOINTS]
-        self._arm_u = [int(self._model.actuator(ARM_PREFIX + n).id) for n in ARM_JOINTS]
+        joints = [self.robot.prefix + name for name in self.robot.joints]
+        self._arm_q = [int(self._model.joint(n).qposadr[0]) for n in joints]
+        self._arm_v = [int(self._model.joint(n).dofadr[0]) for n in joints]
+        self._arm_u = [int(self._model.actuator(n).id) for n in joints]
         self._arm_range = self._model.actuator_ctrlrange[self._arm_u].copy()
         self._base_q = [int(self._model.joint(n).qposadr[0]) for n in BASE_JOINTS]
         self._base_u = [int(self._model.actuator(n).id) for n in BASE_JOINTS]
         self._base_body = int(self._model.body("base_link").id)
-        self._fingers = tuple(
-            int(self._model.geom(ARM_PREFIX + n).id)
-            for n in (FIXED_FINGER_GEOM, MOVING_FINGER_GEOM)
-        )
+        self._fingers = tuple(int(self._model.geom(n).id) for n in self.robot.fingers)
         self._geom_of = {o.name: int(self._model.geom(o.name).id) for o in self._layout.objects}
-        self.place(self._layout.base_start, REST_POSE)
+        self.place(self._layout.base_start, self.robot.rest_pose)
         for _ in range(SETTLE_STEPS):
             self.step(None, None)
         self.steps = 0
@@ -170,9 +160,9 @@ class SimEnv:
         if base_velocity is not None:
             twist = _finite(base_velocity, 3, "a base velocity (vx, vy, wz)")
         if isinstance(arm_target, Mapping):
-            arm_target = [arm_target[name] for name in ARM_JOINTS]
+            arm_target = [arm_target[name] for name in self.robot.joints]
         if arm_target is not None:
-            values = _finite(arm_target, len(ARM_JOINTS), "an arm target in rad")
+            values = _finite(arm_target, len(self.robot.joints), "an arm target in rad")
             self._data.ctrl[self._arm_u] = values
             self._data.ctrl[self._arm_u] = self._data.ctrl[self._arm_u].clip(*self._arm_range.T)
         speed = math.hypot(twist[0], twist[1])
@@ -204,12 +194,12 @@ class SimEnv:
         return self._layout
 
     def joint_state(self) -> dict[str, float]:
-        """Measured arm joint angles in rad, by name, in the order of `ARM_JOINTS`."""
-        return dict(zip(ARM_JOINTS, self._data.qpos[self._arm_q].tolist(), strict=True))
+        """Measured arm joint angles in rad, by name, in the order of `robot.joints`."""
+        return dict(zip(self.robot.joints, self._data.qpos[self._arm_q].tolist(), strict=True))
 
     def joint_velocity(self) -> dict[str, float]:
         """Measured arm joint velocities in rad/s, by name."""
-        return dict(zip(ARM_JOINTS, self._data.qvel[self._arm_v].tolist(), strict=True))
+        return dict(zip(self.robot.joints, self._data.qvel[self._arm_v].tolist(), strict=True))
 
     def base_pose(self) -> tuple[float, float, float]:
         """Odometry: x, y (m) and yaw (rad) of the base in the map frame."""
@@ -218,7 +208,7 @@ class SimEnv:
 
     def gripper_position(self) -> tuple[float, float, float]:
         """Return the grasp point between the fingers, in the base frame (forward kinematics)."""
-        return self._to_base(self._data.site(ARM_PREFIX + GRASP_SITE).xpos)
+        return self._to_base(self._data.site(self.robot.grasp_site).xpos)
 
     # -- cameras
     def render(self, camera: str) -> Any:

@@ -35,7 +35,7 @@ def to_map(base: Pose2D, x_m: float, y_m: float) -> tuple[float, float]:
 
 def front_reach_m(config: SceneConfig, yaw_rad: float) -> float:
     """Return how far the base's box reaches along the map's x from its origin, at this yaw."""
-    front = config.mount_in_base_m[0] + 0.05
+    front = config.mount_in_base_m[0] + config.base_front_of_mount_m
     return front * abs(math.cos(yaw_rad)) + config.base_half_size_m[1] * abs(math.sin(yaw_rad))
 
 

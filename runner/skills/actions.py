@@ -31,6 +31,7 @@ Kind = Literal[
     "cartesian_twist",
     "cartesian_pose",
     "base_velocity",
+    "composite_mode",
     "terminate",
 ]
 
@@ -40,6 +41,7 @@ STEP_MAX_M = 0.25
 STEP_MAX_RAD = 1.0
 TERMINATE_ABOVE = 0.5
 OPEN_ABOVE = 0.5
+BASE_ABOVE = 0.0  # of the composite mode: -1 manipulates, 1 navigates
 TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
@@ -60,8 +62,7 @@ class ActionPlan:
     """A contract resolved for one robot.
 
     `joints` are those that it commands. `scales` turn the policy's numbers into m and rad, `bounds`
-    are the ends to which they are clipped before (None: none has any). `notes` are parts of the
-    contract that change nothing on this robot.
+    are the ends to which they are clipped before (None: none has any).
     """
 
     dim: int
@@ -69,7 +70,6 @@ class ActionPlan:
     commands: tuple[Command, ...]
     joints: tuple[str, ...]
     bounds: tuple[tuple[float, float], ...] | None = None
-    notes: tuple[str, ...] = ()
 
     def rows(self, actions: Any) -> list[Row]:
         """Return the rows of a chunk in m and rad.
@@ -138,13 +138,35 @@ class Stepper:
         self._joints = {joint.name: joint for joint in robot.joints}
         # those that are told where to be and take their time to come there
         self._slow = {j.name for j in robot.joints if j.gripper or leading} & self._longest.keys()
+        mode = next((c for c in plan.commands if c.kind == "composite_mode"), None)
+        self._mode_at = None if mode is None else mode.at[0]
+        grippers = {joint.name for joint in robot.joints if joint.gripper}
+        self._arm_commands = {
+            command
+            for command in plan.commands
+            if command.kind != "base_velocity" and not grippers.issuperset(command.joints)
+        }
+
+    def _turns(self, row: Row) -> tuple[bool, bool]:
+        """Return whether a row moves the base, and whether it moves the arm.
+
+        A composite mode, as of robosuite's HybridMobileBase, gives the step to one of them: to the
+        base above 0, else to the arm. Grippers move in both.
+        """
+        if self._mode_at is None:
+            return True, True
+        base = row[self._mode_at] > BASE_ABOVE
+        return base, not base
 
     def step(self, row: Row, start: Mapping[str, float]) -> RowStep:
         """Return what to do from the joint targets `start` (rad). Raises ModelError for a step
         that no unit explains.
         """
         done = RowStep({})
+        base_moves, arm_moves = self._turns(row)
         for command in self._plan.commands:
+            if command in self._arm_commands and not arm_moves:
+                continue
             values = [row[index] for index in command.at]
             match command.kind:
                 case "joint_position":
@@ -158,9 +180,11 @@ class Stepper:
                         joint.upper_rad if values[0] > OPEN_ABOVE else joint.lower_rad
                     )
                 case "base_velocity":
-                    told = dict(zip(command.joints, values, strict=True))
+                    told = dict(zip(command.joints, values, strict=True)) if base_moves else {}
                     vx, vy, vz, wx, wy, wz = (told.get(name, 0.0) for name in TWIST)
                     done.twist = (vx, vy, vz, wx, wy, wz)
+                case "composite_mode":
+                    pass  # read above
                 case "terminate":
                     done.terminated |= values[0] > TERMINATE_ABOVE
                 case _:

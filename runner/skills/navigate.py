@@ -10,13 +10,14 @@ its map.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from vram_arbiter.runner.planar import yaw_of
 from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
-from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig, wrap_angle
+from vram_arbiter.runner.sim.config import SceneConfig, wrap_angle
 from vram_arbiter.runner.sim.navigate import PlanarController, Pose2D, standoff_pose, to_map
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.runner.skills.motion import JointRamp, action_of, is_at, joint_positions
@@ -30,7 +31,6 @@ SETTLE_STEPS = (
 )
 STUCK_STEPS = 120  # four seconds at 30 Hz without coming closer
 CLOSER_M, CLOSER_RAD = 0.002, 0.005  # what counts as closer
-FOLDED_JOINTS = ARM_JOINTS[:-1]  # the gripper may hold something
 
 Distance = Annotated[Finite, Field(ge=-100, le=100)]
 
@@ -125,11 +125,22 @@ def goal_pose(params: NavigateParams, here: Pose2D, config: SceneConfig) -> Pose
 
 
 class Navigate(SkillBase):
-    """Fold, drive, stand still. Fails with `goal_rejected` when the base stops coming closer."""
+    """Fold to `rest_pose_rad`, drive, stand still.
 
-    def __init__(self, manifest: RSkillManifest, config: SceneConfig, *, period_s: float) -> None:
+    The rest pose leaves out the gripper, which may hold something. Fails with `goal_rejected` when the base stops coming closer.
+    """
+
+    def __init__(
+        self,
+        manifest: RSkillManifest,
+        config: SceneConfig,
+        rest_pose_rad: Mapping[str, float],
+        *,
+        period_s: float,
+    ) -> None:
         super().__init__(manifest)
         self._config = config
+        self._rest = rest_pose_rad
         self._period_s = period_s
         self._params: NavigateParams | None = None
         self._reset()
@@ -177,13 +188,12 @@ class Navigate(SkillBase):
 
     def _fold_arm(self, world: WorldState) -> Action | None:
         """Return the next step towards the folded pose, or None once the arm is there."""
-        rest = dict(zip(FOLDED_JOINTS, REST_POSE, strict=False))
-        measured = joint_positions(world, FOLDED_JOINTS)
+        measured = joint_positions(world, tuple(self._rest))
         if self._fold is None:
-            if is_at(measured, rest):
+            if is_at(measured, self._rest):
                 self._folded = True
                 return None
-            self._fold = JointRamp(measured, rest, period_s=self._period_s)
+            self._fold = JointRamp(measured, self._rest, period_s=self._period_s)
         if self._fold.done(measured):
             self._folded = True
             return None

@@ -6,6 +6,7 @@ An adapter knows its model and nothing of leases, sockets or bytes.
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
+from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import DetectOp, EndpointCall, QueryOp, ScoreOp
 
@@ -19,6 +20,13 @@ PEFT = "vram_arbiter.sidecars.preload_peft"
 type Inputs = Mapping[str, Any]
 """Inputs of a model by name: tensors, texts."""
 ModelCall = DetectOp | QueryOp | ScoreOp | EndpointCall
+
+
+def has_model(manifest: RSkillManifest) -> bool:
+    """Return whether a manifest is served by a model: `policy_extras.adapter` names code that is
+    none.
+    """
+    return "adapter" not in manifest.policy_extras
 
 
 class ModelAdapter(Protocol):

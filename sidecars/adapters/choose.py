@@ -6,14 +6,17 @@ from typing import Final
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import DetectorEngine, Runtime
-from vram_arbiter.sidecars.adapters.base import ModelAdapter
+from vram_arbiter.sidecars.adapters.base import ModelAdapter, has_model
 from vram_arbiter.sidecars.adapters.detector import ZERO_SHOT_LOADER, DetectorAdapter
-from vram_arbiter.sidecars.adapters.gpu_passthrough import GpuPassthroughAdapter, is_passthrough
+from vram_arbiter.sidecars.adapters.gpu_passthrough import ADAPTER as PASSTHROUGH
+from vram_arbiter.sidecars.adapters.gpu_passthrough import GpuPassthroughAdapter
 from vram_arbiter.sidecars.adapters.locate_anything import LOADER, LocateAnythingAdapter
 from vram_arbiter.sidecars.adapters.onnx_detector import OnnxDetectorAdapter
 from vram_arbiter.sidecars.adapters.policy import PolicyAdapter
 from vram_arbiter.sidecars.adapters.reward import RewardAdapter
 from vram_arbiter.sidecars.adapters.scene_vlm import SceneVlmAdapter
+from vram_arbiter.sidecars.adapters.scripted_pick import ADAPTER as SCRIPTED_PICK
+from vram_arbiter.sidecars.adapters.scripted_pick import ScriptedPickAdapter
 from vram_arbiter.sidecars.weights import Weights
 
 ONNX: Final = frozenset({Runtime.ONNX, Runtime.TENSORRT})
@@ -23,6 +26,11 @@ _ADAPTERS: Final[Mapping[Kind, Callable[[RSkillManifest, Weights], ModelAdapter]
     Kind.VLA: PolicyAdapter,
     Kind.REWARD: RewardAdapter,
 }
+_WITHOUT_MODEL: Final[Mapping[str, Callable[[RSkillManifest], ModelAdapter]]] = {
+    PASSTHROUGH: GpuPassthroughAdapter,
+    SCRIPTED_PICK: ScriptedPickAdapter,
+}
+"""By `policy_extras.adapter`."""
 
 
 def make_adapter(manifest: RSkillManifest, weights: Weights) -> ModelAdapter:
@@ -55,8 +63,14 @@ def make_adapter(manifest: RSkillManifest, weights: Weights) -> ModelAdapter:
                 hint=f"write {ZERO_SHOT_LOADER}, or {LOADER} for LocateAnything",
             )
         return DetectorAdapter(manifest, weights)
-    if manifest.kind is Kind.VLA and is_passthrough(manifest):
-        return GpuPassthroughAdapter(manifest)
+    if manifest.kind is Kind.VLA and not has_model(manifest):
+        name = str(manifest.policy_extras["adapter"])
+        if name not in _WITHOUT_MODEL:
+            raise ConfigError(
+                f"{manifest.name}: policy_extras.adapter {name!r} is not served",
+                hint=f"use {' or '.join(_WITHOUT_MODEL)}, or leave it out for a model",
+            )
+        return _WITHOUT_MODEL[name](manifest)
     if adapter := _ADAPTERS.get(manifest.kind):
         return adapter(manifest, weights)
     raise ConfigError(

@@ -1,6 +1,7 @@
 """The main job, whole: `vramctl demo` with six real processes, with and without the arbiter."""
 
 import contextlib
+import importlib.util
 import json
 import os
 import pty
@@ -118,3 +119,16 @@ def test_without_the_arbiter_the_same_loop_runs_out_of_memory(tmp_path: Path) ->
     assert not summary["completed"]
     assert summary["oom_events"] >= 1
     assert code == 0, "an out-of-memory is what this run is to show"
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("arbiter", ["on", "off"])
+def test_a_panda_finds_navigates_and_grabs(tmp_path: Path, arbiter: str) -> None:
+    """The detector's 5.3 GB and the policy's 4.3 GB do not fit beside each other."""
+    if importlib.util.find_spec("robosuite") is None:
+        pytest.skip("needs robosuite's files: .ci/setup full")
+    options = ("--robot", "panda-mobile", "--seed", "2", "--arbiter", arbiter)
+    code, summary = run_demo(tmp_path, *options)
+    assert code == 0
+    assert summary["completed"] == (arbiter == "on"), summary
+    assert bool(summary["oom_events"]) == (arbiter == "off")

@@ -138,8 +138,11 @@ def full(project: Path) -> Path:
 
 
 def installed(project: Path) -> list[str]:
+    """What uv was asked to install with its dependencies, in order; robosuite comes without."""
     lines = (project / "log").read_text(encoding="utf-8").splitlines()
-    return [line.rpartition(" ")[2] for line in lines if line.startswith("uv pip")]
+    asked = [line for line in lines if line.startswith("uv pip")]
+    assert asked[-1].endswith("-c constraints.txt --no-deps robosuite")
+    return [line.rpartition(" ")[2] for line in asked if "--no-deps" not in line]
 
 
 def test_without_gstreamer_everything_else_is_installed_and_what_is_missing_is_said(

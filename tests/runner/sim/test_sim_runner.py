@@ -523,7 +523,7 @@ def test_navigating_the_real_simulator_and_filming_it(
     recorder = VideoRecorder(tmp_path / "episode.mp4", fps=10)
     runner = sim_runner(world, seed=1, rate_hz=0)
     runner.robot.video.recorder = recorder
-    skill = Navigate(load_manifest(navigate_manifest), scene, period_s=1 / 30)
+    skill = Navigate(load_manifest(navigate_manifest), scene, {}, period_s=1 / 30)
     ended: list[SkillEnded] = []
     try:
         runner.activate()

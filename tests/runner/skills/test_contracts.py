@@ -183,12 +183,21 @@ def test_a_cartesian_delta_moves_the_tool_by_it(panda: Bench, frame: str) -> Non
     assert turned == pytest.approx(axes @ [0.0, 0.0, 20 * turning], abs=0.01)
 
 
-def test_the_fields_vector_drives_arm_gripper_and_base_at_once(panda: Bench) -> None:
-    """Robosuite's units come from the deployment: the manifests of the field do not state them."""
+def test_the_fields_vector_drives_arm_or_base_by_its_mode(panda: Bench) -> None:
+    """Robosuite's units come from the deployment: the manifests of the field do not state them.
+
+    A row moves the base where its composite mode is 1, the arm where it is -1, the gripper in both.
+    """
     wiring = wire_up(skill(FIELD_SLOTS.replace("LAYOUT", "human300_16d")), panda.robot, None)
     before = panda.tool()
-    closing_up = [0, 0, 0.06, 0, 0, 0, 1.0, 0.3, 0.0, 0.5, 0.7, -1.0]
-    panda.play(wiring, [closing_up] * 30)
+    closing_up = [0, 0, 0.06, 0, 0, 0, 1.0, 0.3, 0.0, 0.5, 0.7]
+    panda.play(wiring, [[*closing_up, -1.0]] * 30)
+    panda.wait(0.5)
+    assert panda.tool().xyz - before.xyz == pytest.approx([0, 0, 30 * 0.06 * 0.05], abs=3e-3)
+    world = panda.world()
+    assert world.base_pose is not None
+    assert world.base_pose.xyz == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+    panda.play(wiring, [[*closing_up, 1.0]] * 30)
     panda.wait(0.5)  # the base has stopped by itself: a command stands for a fifth of a second
     assert panda.said == []
     assert panda.tool().xyz - before.xyz == pytest.approx([0, 0, 30 * 0.06 * 0.05], abs=3e-3)
@@ -205,7 +214,6 @@ def test_the_fields_vector_drives_arm_gripper_and_base_at_once(panda: Bench) -> 
     )
     assert 2 * math.asin(world.base_pose.quat_xyzw[2]) == pytest.approx(turned, abs=0.05)
     assert world.base_twist == pytest.approx((0.0,) * 6, abs=0.02)
-    assert [note.partition(":")[0] for note in wiring.actions.notes] == ["action_contract.slots[4]"]
 
 
 def test_joints_in_the_policys_order_in_degrees_with_a_gripper_in_percent() -> None:
@@ -465,7 +473,7 @@ def test_a_goal_of_the_fields_policy_runs_on_the_robot(
         (None, 20, 0)
     ]
     assert [state.shape for state in client.states] == [(16,)] * 4
-    assert panda.tool().xyz[0] - before == pytest.approx(20 * 0.1 * 0.05, abs=5e-3)
+    assert panda.tool().xyz[0] == pytest.approx(before, abs=5e-3), "the mode gives it to the base"
     world = panda.world()
     assert world.base_pose is not None
     assert world.base_pose.xyz[0] == pytest.approx(0.2 * (20 / HZ + 0.2), abs=0.03)
@@ -515,7 +523,7 @@ def test_the_gate_still_keeps_the_tool_out_of_zones_and_slow(panda: Bench) -> No
     assert any("the tool would move 20 mm" in text for text in panda.said)
     fast = wire_up(skill(FIELD_SLOTS.replace("LAYOUT", "rc365")), panda.robot, None)
     panda.said.clear()
-    panda.play(fast, [[0.0] * 6 + [-1.0, 2.0, 0.0, 0.0, 0.0, 0.0]])
+    panda.play(fast, [[0.0] * 6 + [-1.0, 2.0, 0.0, 0.0, 0.0, 1.0]])
     assert any("base speed 2.00 m/s" in text for text in panda.said)
 
 
@@ -525,7 +533,7 @@ def test_a_task_space_state_is_poses_and_fingers_in_the_layouts_order(
     panda: Bench, layout: str
 ) -> None:
     wiring = wire_up(skill(FIELD_SLOTS.replace("LAYOUT", layout)), panda.robot, None)
-    panda.play(wiring, [[0.0] * 6 + [0.0, 0.3, 0.1, 0.4, 0.0, 0.0]] * 10)
+    panda.play(wiring, [[0.0] * 6 + [0.0, 0.3, 0.1, 0.4, 0.0, 1.0]] * 10)
     panda.wait(0.5)
     world, measured = panda.world(), panda.measured()
     assert world.base_pose is not None

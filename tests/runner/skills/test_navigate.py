@@ -20,11 +20,12 @@ from vram_arbiter.schemas.world import JointState, Pose, WorldState
 
 Run = Callable[[Any], Any]
 CONFIG = SceneConfig()
+FOLDED = dict(zip(ARM_JOINTS[:-1], REST_POSE, strict=False))
 
 
 @pytest.fixture
 def skill(navigate_manifest: Path) -> Navigate:
-    return Navigate(load_manifest(navigate_manifest), CONFIG, period_s=1 / 30)
+    return Navigate(load_manifest(navigate_manifest), CONFIG, FOLDED, period_s=1 / 30)
 
 
 def world(env: Any) -> WorldState:
