@@ -63,6 +63,7 @@ IMPORTING = (
     "tests/runner/recording/test_lerobot_format.py",
     "tests/runner/recording/test_recorder.py",
     "tests/runner/robots/test_lerobot_robot.py",
+    "tests/runner/robots/test_teleoperation.py",
     "tests/runner/skills/test_policies_as_lerobot.py",
     "tests/training/",
 )

@@ -296,8 +296,8 @@ async def boot(
     arbiter."""
     gpu, arbiter = what.gpu, what.arbiter
     print(
-        f"starting {'the arbiter, ' if arbiter else ''}{len(what.sidecars)} sidecars and the runner "
-        "(imports take a while) …"
+        f"starting {'the arbiter, ' if arbiter else ''}{len(what.sidecars)} sidecars and the "
+        "runner (imports take a while) …"
     )
     if what.robot in NOTES:
         print(f"note: {NOTES[what.robot]}")

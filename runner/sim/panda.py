@@ -2,7 +2,8 @@
 
 Kinematics, inertias, gripper and collision meshes are the wheel's (MIT); its visual meshes (220,000
 faces) are left out, as the SO-101's are. Joint servos take the place of its torque motors. Names in
-the model are those of `configs/robots/models/panda_mobile.xml`, whose frames are at the same places.
+the model are those of `configs/robots/models/panda_mobile.xml`, whose frames are at the same
+places.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from vram_arbiter.runner.sim.scene import (
 
 PREFIX: Final = "panda_"
 INSTALL: Final = "pip install --no-deps robosuite==1.5.2"
-"""Without its dependencies: its pins of mink and OpenCV are not ours, and only its files are read."""
+"""Without its dependencies: its pins of mink and OpenCV are not ours; only its files are read."""
 REST_POSE: Final = (0.0, -1.35, 0.0, -2.55, 0.0, 1.20, 0.785, 0.04)  # rad, the gripper m
 KP, GRIPPER_N = 2000.0, 40.0  # N m/rad; the force of both fingers
 _SHELL, _DARK = (0.86, 0.87, 0.90), (0.35, 0.36, 0.40)  # the SO-101's: the scene VLM knows them
@@ -73,7 +74,7 @@ def _arm() -> Any:
 
 
 def _gripper() -> Any:
-    """Return the gripper as one joint, `gripper`: the way of one finger, which the other mirrors."""
+    """Return the gripper as one joint, `gripper`: the way of a finger, which the other mirrors."""
     mujoco = load_mujoco()
     spec = _bare(_mjcf("grippers", "panda_gripper.xml"))
     leader = spec.joint("finger_joint1")

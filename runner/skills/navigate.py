@@ -127,7 +127,8 @@ def goal_pose(params: NavigateParams, here: Pose2D, config: SceneConfig) -> Pose
 class Navigate(SkillBase):
     """Fold to `rest_pose_rad`, drive, stand still.
 
-    The rest pose leaves out the gripper, which may hold something. Fails with `goal_rejected` when the base stops coming closer.
+    The rest pose leaves out the gripper, which may hold something. Fails with `goal_rejected` when
+    the base stops coming closer.
     """
 
     def __init__(

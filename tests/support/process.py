@@ -31,7 +31,7 @@ class ArbiterProcess:
     The folder is short (a socket path holds 107 bytes) and holds `arbiter.sock`, `state/`, the
     simulated GPU `fakegpu/` and `arbiter.log`. `environ` is what clients need to find it.
     `prepared`: fork the daemon from an interpreter that has imported it, unless it is started with
-    a program of its own.
+    a program or a path of libraries of its own: that is read by a new program alone.
     """
 
     def __init__(
@@ -106,7 +106,8 @@ class ArbiterProcess:
         }
         with (self.runtime / "arbiter.log").open("ab") as log:
             program, given = self.command()[: len(PROGRAM)], self.command()[len(PROGRAM) :]
-            if self._prepared and program == list(PROGRAM):
+            own = program != list(PROGRAM) or "LD_LIBRARY_PATH" in (extra_environ or {})
+            if self._prepared and not own:
                 self.process = start("vram-arbiter", given, environ, log.fileno(), log.fileno())
                 return self.process
             self.process = subprocess.Popen(

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from tests.runner.skills.test_sidecar_policy import Arbiter, Sidecar
+from tests.runner.skills.policy_bench import Arbiter, Sidecar
 from tests.runner.small_robots import FedCamera
 from tests.support.waiting import until
 from vram_arbiter.clients.runner import RunnerClient
@@ -313,6 +313,7 @@ async def test_a_dead_leader_takes_nothing_over(bench: Bench) -> None:
         await bench.client.take_over("take")
 
 
+@pytest.mark.nightly  # lerobot's writer and reader, 30 s
 async def test_demonstrations_and_take_overs_are_rows_that_lerobot_reads(
     bus: ServoBus,
     calibrated: Path,

@@ -1,4 +1,4 @@
-"""The simulated Panda on its mobile base: the model's places, and a pick by the 12-slot contract."""
+"""The simulated Panda on its mobile base: the model's places, a pick by the 12-slot contract."""
 
 import random
 from collections.abc import Iterator

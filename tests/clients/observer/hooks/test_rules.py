@@ -61,7 +61,7 @@ def test_an_editor_accepts_the_example_and_marks_mistakes() -> None:
         ("    on: granted\n    command: sh -c x", "command"),
         ("    on: granted\n    command: []", "at least 1 item"),
         ("    on: granted\n    webhook: ftp://x/", "expected the URL of a webhook"),
-        ("    on: granted\n    webhook: https://me:secret@x/", "user nor fragment, got 'x/'"),
+        ("    on: granted\n    webhook: https://me:secret@x/", "user and fragment, got 'x/'"),
         ("    on: granted\n    webhook: http://robot/\n    headers_file: /h", "in the clear"),
         ("    on: granted\n    command: [a]\n    timeout_s: 0", "greater than 0"),
         ("    on: lost\n    command: [a]\n  - {name: h, on: lost, command: [b]}", "are named h"),
