@@ -19,8 +19,8 @@ BIN := .venv/bin
 CORE := .venv-core/bin
 # Test tools import `tests.support` from here.
 TOOL := PYTHONPATH=. $(BIN)/python
-# Six workers keep two cores busy: half of the tests wait for processes most of their time.
-WORKERS ?= 6
+# Four workers keep two cores busy: half of the tests wait for processes most of their time.
+WORKERS ?= 4
 # One worker for each file, in the order of tests/conftest.py: the longest first.
 BY_FILE := --dist loadfile --no-loadscope-reorder
 

@@ -60,7 +60,6 @@ LONGEST = (
 IMPORTING = (
     "tests/sidecars/adapters/",
     "tests/sidecars/test_quantization.py",
-    "tests/runner/recording/test_lerobot_format.py",
     "tests/runner/recording/test_recorder.py",
     "tests/runner/robots/test_lerobot_robot.py",
     "tests/runner/robots/test_teleoperation.py",

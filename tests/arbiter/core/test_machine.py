@@ -469,4 +469,4 @@ class Leases(RuleBasedStateMachine):
 
 
 TestLeases = Leases.TestCase
-TestLeases.settings = walk(60)
+TestLeases.settings = walk(30)

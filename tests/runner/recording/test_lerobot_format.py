@@ -24,6 +24,7 @@ from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.world import JointState
 
 pytestmark = [
+    pytest.mark.nightly,  # datasets of lerobot's own writers and programs: 45 s of a core
     pytest.mark.heavy,
     pytest.mark.timeout(600),
     pytest.mark.usefixtures("forked_writers"),
@@ -88,7 +89,6 @@ def offline(monkeypatch: pytest.MonkeyPatch, cache: Path) -> None:
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", cache)
 
 
-@pytest.mark.nightly  # lerobot's program, and another import of all of lerobot
 def test_lerobot_replay_drives_a_robot_with_the_recorded_actions(
     root: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
