@@ -241,9 +241,9 @@ async def _episode(programs: Programs, runtime: Path, what: Episode) -> JsonObje
         await _watch(programs, reasoner, client, display, watch)
         truth = await runner.ground_truth()
         seconds = time.monotonic() - watch.start_s
+        await programs.stop("runner")  # finishes the video
         if client is not None:
             await _until_back(client, display, watch)
-    await programs.stop("runner")  # finishes the video
     story = _story(folder, gpu, programs.pids(), watch)
     outcome = (
         json.loads(result_file.read_text())
