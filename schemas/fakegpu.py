@@ -25,6 +25,7 @@ comes back `release_lag_s` late, also that of a dead process; what does not fit 
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Annotated, Literal, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -197,6 +198,7 @@ def is_process_file(name: str) -> bool:
 
 
 # -- texts
+@lru_cache(maxsize=16)  # each reading reads it, and it is edited by hand
 def parse_config(text: str | bytes) -> FakeGpuConfig:
     """Read `gpu.json`. Raises ConfigError."""
     return _parsed(FakeGpuConfig, GPU_FILE, text, "correct it")

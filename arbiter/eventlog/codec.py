@@ -13,6 +13,7 @@ from operator import attrgetter
 from typing import Any, Final, get_args
 
 import msgpack
+import pydantic_core
 
 from vram_arbiter.arbiter.core.effects import Effect, Note, Push
 from vram_arbiter.arbiter.core.events import Event
@@ -23,8 +24,12 @@ EVENTS: Final[Mapping[str, type]] = {cls.__name__: cls for cls in get_args(Event
 
 
 def to_json(value: object) -> str:
-    """One line. Raises TypeError for what is neither plain, a dataclass nor a mapping."""
-    return _JSON.encode(value)
+    """One line of a dataclass or of plain values. Raises TypeError for anything else."""
+    plain = to_map(value) if is_dataclass(value) else value
+    try:
+        return pydantic_core.to_json(plain, fallback=_as_plain).decode()
+    except pydantic_core.PydanticSerializationError:  # half a surrogate pair, or of no known type
+        return _JSON.encode(value)
 
 
 def decode_event(name: str, data: object) -> Event:

@@ -107,7 +107,7 @@ def entry_line(now: float, event: Event, effects: Sequence[Effect] | None) -> st
     facts = {
         "t": now,
         "event": type(event).__name__,
-        "data": event,
+        "data": to_map(event),
         "effects": "" if effects is None else summary(effects),
         "digest": None if effects is None else digest(effects),
     }

@@ -19,6 +19,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self
 
+from pydantic_core import PydanticSerializationError, to_json
+
 from vram_arbiter.arbiter.host.disk_writer import DiskBehind, DiskFailed, DiskWriter
 from vram_arbiter.arbiter.host.journal_files import is_corruption, put_aside
 from vram_arbiter.schemas import strictjson
@@ -182,6 +184,13 @@ class History:
             self.problem = f"history cannot be written ({failure}): events are in memory only"
 
 
+def _text(event: Event) -> str:
+    try:
+        return to_json(event, fallback=str).decode()
+    except PydanticSerializationError:  # half a surrogate pair, which only escapes can hold
+        return json.dumps(event, separators=(",", ":"), default=str)
+
+
 def _event(seq: int, at_wall_s: object, text: str) -> Event:
     """Return the event of one row; a damaged one keeps its number, so that paging goes on."""
     with contextlib.suppress(ValueError, TypeError):
@@ -272,10 +281,7 @@ class _Store:
 
     def write(self, items: Sequence[Event]) -> None:
         self._owed.extend(items)
-        rows = [
-            (e["seq"], e["at_wall_s"], e["kind"], json.dumps(e, separators=(",", ":"), default=str))
-            for e in self._owed
-        ]
+        rows = [(e["seq"], e["at_wall_s"], e["kind"], _text(e)) for e in self._owed]
         with self._db:
             self._db.execute("BEGIN IMMEDIATE")
             self._db.executemany("INSERT OR REPLACE INTO events VALUES (?, ?, ?, ?)", rows)
