@@ -120,8 +120,8 @@ def test_22_a_load_may_take_as_long_as_it_takes(driver: CoreDriver) -> None:
     vlm = driver.consumer("vlm")
     lease = vlm.acquire(5 * GIB, ttl_s=10.0)
     waiter = driver.consumer("w").acquire(5 * GIB)
-    for n in range(40):  # fourteen times its TTL
-        vlm.hold(n * 125 * MIB)
+    for n in range(100):  # longer than the five minutes of ollama
+        vlm.hold(n * 50 * MIB)
         answer(vlm.renew((lease, vlm.token(lease))))
         driver.advance(3.5)
     assert (driver.state(lease), driver.state(waiter)) == ("loading", "queued")
