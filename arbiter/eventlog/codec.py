@@ -73,9 +73,11 @@ _JSON = json.JSONEncoder(separators=(",", ":"), default=_as_plain)
 @cache
 def _values_of(cls: Any) -> Callable[[Any], Sequence[object]] | None:
     """Return what takes a dataclass apart: the name of its class and its values."""
-    names = [field.name for field in fields(cls)] if is_dataclass(cls) else []
-    # with one name alone it would return that value
-    return attrgetter("__class__.__name__", *names) if names else None
+    if not is_dataclass(cls):
+        return None
+    names = [field.name for field in fields(cls)]
+    take_apart = attrgetter("__class__.__name__", *names)
+    return take_apart if names else lambda value: (take_apart(value),)  # of one alone: no tuple
 
 
 def _packable(value: Any) -> Any:

@@ -2,7 +2,7 @@
 effects."""
 
 import json
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, make_dataclass, replace
 from types import NoneType, UnionType
 from typing import Any, NewType, TypeAliasType, Union, get_args, get_origin, get_type_hints
 
@@ -127,3 +127,10 @@ def test_the_digest_sees_order_kind_and_every_value() -> None:
 
 def test_an_event_without_fields_is_an_empty_map() -> None:
     assert to_json(Tick()) == "{}"
+
+
+def test_a_digest_tells_effects_without_fields_apart() -> None:
+    """Regression: of a class without fields the digest had an empty map, without its name."""
+    made: list[Any] = [make_dataclass(name, []) for name in ("Paused", "Resumed")]
+    paused, resumed = (digest([one()]) for one in made)
+    assert paused != resumed

@@ -218,10 +218,9 @@ def test_a_lender_that_never_held_anything_keeps_nothing() -> None:
     assert driver.gpu()["charged_bytes"] == 0
 
 
-@pytest.mark.parametrize("leaves", [False, True])
-def test_a_newcomer_that_is_ready_before_a_reading_ends_hides_no_release(leaves: bool) -> None:
-    """Regression (leases, seed 20778062337): what had become ready since the reading began counted
-    as on it, in place of what was going."""
+def restarted_in_a_load() -> tuple[CoreDriver, LeaseId, Consumer, LeaseId]:
+    """Return a driver after a restart, without a reading from before it, with a lease that is going
+    and has not gone, and a newcomer with its lease, which loads."""
     driver = hidden_gpu(lists=False)
     small, lease = held(driver, "small", 0.5)
     driver.advance(1.0)
@@ -230,9 +229,17 @@ def test_a_newcomer_that_is_ready_before_a_reading_ends_hides_no_release(leaves:
     wanted = newcomer.acquire(1 * GIB)
     driver.until(lambda: driver.state(wanted) == "loading")
     small.unload(lease)
-    driver.restart()  # no reading from before it
+    driver.restart()
     newcomer.connect()
     newcomer.reattach(wanted, newcomer.token(wanted), held=False)
+    return driver, lease, newcomer, wanted
+
+
+@pytest.mark.parametrize("leaves", [False, True])
+def test_a_newcomer_that_is_ready_before_a_reading_ends_hides_no_release(leaves: bool) -> None:
+    """Regression (leases, seed 20778062337): what had become ready since the reading began counted
+    as on it, in place of what was going."""
+    driver, _, newcomer, wanted = restarted_in_a_load()
     driver.advance(0.0)
     newcomer.load(wanted)
     if leaves:
@@ -268,17 +275,7 @@ def test_a_newcomer_that_has_left_before_a_reading_ends_hides_no_release(ends: s
 def test_a_load_that_its_process_did_not_survive_hides_no_release() -> None:
     """It died while a reading was under way, which may have seen none of what it is charged for:
     after a restart, without a baseline, its debt would cover what is going."""
-    driver = hidden_gpu(lists=False)
-    small, lease = held(driver, "small", 0.5)
-    driver.advance(1.0)
-    driver.device.lag_s = 2.0
-    newcomer = driver.consumer("newcomer")
-    wanted = newcomer.acquire(1 * GIB)
-    driver.until(lambda: driver.state(wanted) == "loading")
-    small.unload(lease)
-    driver.restart()
-    newcomer.connect()
-    newcomer.reattach(wanted, newcomer.token(wanted), held=False)
+    driver, lease, newcomer, _ = restarted_in_a_load()
     driver.device.reading_s = 1.0
     driver.advance(0.1)
     newcomer.die()
