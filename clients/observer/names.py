@@ -60,12 +60,16 @@ METRIC_CHARGED = metric("vram_arbiter.gpu.charged", "By", "Bytes on the ledger")
 METRIC_MEASURED = metric("vram_arbiter.gpu.measured", "By", "Bytes held by a consumer's processes")
 METRIC_USED = metric("vram_arbiter.gpu.used", "By", "Bytes held on the GPU")
 METRIC_CAPACITY = metric("vram_arbiter.gpu.capacity", "By", "Bytes of the GPU")
-METRIC_PRESSURE = metric("vram_arbiter.gpu.pressure", "By", "Bytes held beyond the budget")
+METRIC_PRESSURE = metric(
+    "vram_arbiter.gpu.pressure", "By", "Bytes held beyond the budget; normally 0"
+)
 METRIC_READABLE = metric(
-    "vram_arbiter.gpu.readable", "", "1 while the GPU's readings succeed, else 0"
+    "vram_arbiter.gpu.readable", "", "1 while readings succeed, else 0: nothing is granted"
 )
 METRIC_READING_AGE = metric(
-    "vram_arbiter.gpu.reading_age", "s", "Since the newest successful reading"
+    "vram_arbiter.gpu.reading_age",
+    "s",
+    "Since the newest successful reading; an idle arbiter reads rarely",
 )
 METRIC_DRAINED = metric(
     "vram_arbiter.drained", "", "1 while an operator's drain stops grants, else 0"

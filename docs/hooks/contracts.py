@@ -1,4 +1,4 @@
-"""Reference pages of JSON Schemas, of the arbiter's configuration and of the errors."""
+"""Reference pages of JSON Schemas, of the arbiter's configuration, of errors and of metrics."""
 
 import json
 import re
@@ -7,8 +7,11 @@ from pathlib import Path
 
 import yaml
 
+from vram_arbiter.clients.observer import names as of_the_arbiter  # noqa: F401  it describes metrics
+from vram_arbiter.reasoner.llm import names as of_language_models  # noqa: F401  as above
 from vram_arbiter.schemas.errors import CODES, VramError
 from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.runtime.telemetry.names import INSTRUMENTS
 
 type Schema = JsonMap
 
@@ -123,6 +126,15 @@ def _comment(lines: list[str]) -> str:
         else:
             cell += f" {_cell(line)}"
     return cell.strip()
+
+
+def metrics() -> str:
+    """Return a table of every program's metrics."""
+    rows = [
+        f"| `{name}`{' h' if about.bounds else ''} | {about.unit} | {about.description} |"
+        for name, about in sorted(INSTRUMENTS.items())
+    ]
+    return "\n".join(["| metric | unit | meaning |", "| --- | --- | --- |", *rows])
 
 
 def errors() -> str:

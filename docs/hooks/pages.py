@@ -39,6 +39,7 @@ LANGUAGES = {".py": "python", ".pl": "perl", ".yaml": "yaml", ".json": "json", "
 GENERATED: Mapping[str, Callable[[], str]] = {
     "configuration": lambda: contracts.configuration((TREE / "configs/arbiter.yaml").read_text()),
     "errors": contracts.errors,
+    "metrics": contracts.metrics,
     **{name: partial(programs.page, name) for name in programs.parsers()},
 }
 MARK = re.compile(r"^<!-- generated: ([\w-]+) -->$", re.MULTILINE)

@@ -4,7 +4,7 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -119,15 +119,20 @@ class Machine:
         folder.mkdir()
         manifest = MANIFEST.format(name=name, quantization=quantization)
         (folder / "rskill.yaml").write_text(manifest)
+        program = [str(weights_model.__file__), str(self.weights_bytes)]
+        return self.serve(name, program, folder / "rskill.yaml", *flags)
+
+    def serve(self, name: str, program: Sequence[str], rskill: Path, *flags: str) -> Model:
+        """Start a sidecar by the arguments of Python that begin its program."""
         argv = [
-            sys.executable, str(weights_model.__file__), str(self.weights_bytes), "--name", name,
-            "--rskill", str(folder / "rskill.yaml"), "--device", self.gpu.device,
-            "--gpu", self.gpu.uuid, *flags,
+            sys.executable, *program, "--name", name, "--rskill", str(rskill),
+            "--device", self.gpu.device, "--gpu", self.gpu.uuid, *flags,
         ]  # fmt: skip
-        with (folder / "log").open("ab") as log:
+        path = self.arbiter.runtime / f"{name}.log"
+        with path.open("ab") as log:
             process = subprocess.Popen(argv, env=self.environ, stdout=log, stderr=log)
         client = WireClient(f"ipc://{self.arbiter.runtime}/{name}.sock")
-        self.models.append(Model(process, client, folder / "log"))
+        self.models.append(Model(process, client, path))
         assert self.models[-1].state() == "unloaded"
         return self.models[-1]
 
@@ -189,13 +194,25 @@ def kind(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def machine(kind: str, make_arbiter: Callable[..., ArbiterProcess]) -> Iterator[Machine]:
-    if kind == "fake":
-        arbiter = make_arbiter().start()
-        made = Machine(kind, arbiter, open_gpu(f"fake:{arbiter.gpu_folder}"), 32 * MIB)
-    else:
-        made = Machine(kind, make_arbiter(gpu="nvml").start(), open_gpu("cuda"), 512 * MIB)
+    made = machine_of(kind, make_arbiter)
     yield made
     made.close()
+
+
+@pytest.fixture
+def small_machine(kind: str, make_arbiter: Callable[..., ArbiterProcess]) -> Iterator[Machine]:
+    """8 GiB are leased of a GPU of any size."""
+    made = machine_of(kind, make_arbiter, config='gpu: {capacity_bytes: {"0": 8GiB}}')
+    yield made
+    made.close()
+
+
+def machine_of(kind: str, make_arbiter: Callable[..., ArbiterProcess], **options: Any) -> Machine:
+    if kind == "fake":
+        arbiter = make_arbiter(**options).start()
+        return Machine(kind, arbiter, open_gpu(f"fake:{arbiter.gpu_folder}"), 32 * MIB)
+    arbiter = make_arbiter(gpu="nvml", **options).start()
+    return Machine(kind, arbiter, open_gpu("cuda"), 512 * MIB)
 
 
 def back(machine: Machine, used_bytes: int) -> bool:

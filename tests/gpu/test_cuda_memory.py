@@ -26,6 +26,7 @@ def test_ballast_fills_up_and_goes() -> None:
     from vram_arbiter.sidecars.device.memory import fill
 
     memory = CudaMemory()
+    assert os.environ["PYTORCH_CUDA_ALLOC_CONF"] == "expandable_segments:True"
     assert memory.used_bytes() == 0
     memory.touch()
     context = memory.used_bytes()

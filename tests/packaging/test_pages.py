@@ -9,7 +9,7 @@ TREE = Path(__file__).parents[2]
 FOLDERS = (
     "arbiter|clients|schemas|sidecars|runner|reasoner|configs|examples|docs|tests|training|src"
 )
-PATH = re.compile(rf"`((?:{FOLDERS})/[\w./-]*|[\w-]+\.(?:md|toml|txt))(?:::(\w+))?`")
+PATH = re.compile(rf"`((?:{FOLDERS}|\.ci)/[\w./-]*|[\w-]+\.(?:md|toml|txt))(?:::(\w+))?`")
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)(?:#([\w-]+))?\)")
 PLACES = ("docs", "training", "configs/models")
 CODE = {".conf", ".example", ".py", ".service", ".sh", ".toml", ".yaml", ".yml"}
@@ -75,6 +75,20 @@ def test_every_decision_is_listed() -> None:
         for path in (TREE / "docs/explanation/adr").glob("0*.md")
         if path.name not in listed
     ] == []
+
+
+def test_every_sentence_of_the_design_records_has_one_place() -> None:
+    """Code and its test, which `test_named_paths_exist` finds; a decision where it is missing."""
+    text = (TREE / "docs/explanation/records.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([EVRC][\w–, -]+) \| .+ \| (.+) \|$", text, re.MULTILINE)
+    found: list[str] = []
+    for sentences, place in rows:
+        for letter, first, last in re.findall(r"([EVR])(\d+)(?:–\1(\d+))?", sentences):
+            found += [f"{letter}{number}" for number in range(int(first), int(last or first) + 1)]
+        of_test = [path.startswith("tests/") for path, _ in PATH.findall(place)]
+        assert set(of_test) == {False, True} or "(adr/" in place, sentences
+    expected = {"E": 37, "V": 40, "R": 78}
+    assert sorted(found) == sorted(f"{x}{n + 1}" for x in expected for n in range(expected[x]))
 
 
 def test_every_page_is_on_the_site() -> None:

@@ -204,7 +204,7 @@ def test_a_shipped_manifest_lacks_at_most_its_weights(check: Check, path: Path) 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_the_page_names_every_policy_family(name: str) -> None:
     family = FAMILIES[name]
-    row = next(line for line in PAGE.splitlines() if line.startswith(f"| `{name}` |"))
+    row = next(line for line in PAGE.splitlines() if f"`{name}`" in "".join(line.split("|")[1:2]))
     for word in (*family.types, *family.packages, *family.precisions):
         assert word in row
 

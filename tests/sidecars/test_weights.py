@@ -1,6 +1,7 @@
 """Where weights come from."""
 
 import json
+import os
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -97,9 +98,11 @@ def asking(dtype: str) -> Any:
 
 
 @pytest.mark.heavy
-def test_the_precision_is_the_manifests_whatever_the_device(tmp_path):
-    """Regression: on the CPU every model was float32, and int8 was bf16 on a GPU."""
+def test_the_precision_is_the_manifests_whatever_the_device(tmp_path, monkeypatch):
+    """Regression: on the CPU every model was float32, and int8 was bf16 on a GPU. Shards are read
+    one after the other."""
     torch = pytest.importorskip("torch")
+    monkeypatch.delenv("HF_DEACTIVATE_ASYNC_LOAD", raising=False)
     (tmp_path / "config.json").write_text("{}")
     weights = Weights(str(tmp_path), local=True)
     types = {"fp32": torch.float32, "fp16": torch.float16, "bf16": torch.bfloat16}
@@ -112,6 +115,7 @@ def test_the_precision_is_the_manifests_whatever_the_device(tmp_path):
         for dtype in ("int8", "fp8", "fp4_nvfp4"):
             with pytest.raises(UnsupportedQuantization):
                 model_options(asking(dtype), weights, device)
+    assert os.environ["HF_DEACTIVATE_ASYNC_LOAD"] == "1"
 
 
 @pytest.mark.heavy

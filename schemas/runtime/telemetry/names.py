@@ -82,7 +82,9 @@ METRIC_INFERENCE = metric("vram_runner.inference.duration", "s", "One request to
 METRIC_CHUNK = metric("vram_runner.chunk.duration", "s", "A chunk's request to its answer", WAITS_S)
 METRIC_PREFETCH = metric("vram_runner.chunk.prefetches", "{chunk}", "Chunks, in time or too late")
 METRIC_STANDING = metric("vram_runner.chunk.standing_steps", "{step}", "Steps without an action")
-METRIC_START_LATE = metric("vram_runner.tick.start_delay", "s", "Late start of a tick", TICKS_S)
+METRIC_START_LATE = metric(
+    "vram_runner.tick.start_delay", "s", "Late start of a goal's ticks", TICKS_S
+)
 METRIC_DEADLINE_MISSES = metric("vram_runner.tick.deadline_misses", "{tick}", "Ticks over too late")
 METRIC_BUDGET_VIOLATIONS = metric("vram_runner.tick.budget_violations", "{tick}", "Overlong ticks")
 METRIC_HAL_READ = metric("vram_runner.hal.read.duration", "s", "One reading of the joints", TICKS_S)

@@ -249,7 +249,10 @@ def test_names_and_units_follow_the_conventions(pages: Pages) -> None:
     }
 
 
-def test_the_reference_names_the_metrics_that_there_are() -> None:
+def test_the_labels_of_the_reference_are_of_metrics_that_there_are() -> None:
     """A metric that is only written down makes an alert that never fires."""
-    named = set(re.findall(r"^\| `([a-z_.]+)[`{]", GUIDE.read_text(), re.M))
-    assert named == set(INSTRUMENTS)
+    named = set(
+        re.findall(r"`((?:vram_[a-z]+|gen_ai\.client|process)\.[a-z_.]+)", GUIDE.read_text())
+    )
+    found = {name for name in named if any(one.startswith(name) for one in INSTRUMENTS)}
+    assert (named - found, len(named) > 10) == (set(), True)

@@ -189,6 +189,7 @@ def test_warnings_about_what_is_missing() -> None:
         ("playbook", "max_steps: 12", "max_steps: 0", "playbook.max_steps: must be greater than 0"),
         ("playbook", 'actions: ["plan"]', 'actions: ["pick"]',
         "actions: must contain 'plan' for kind 'playbook'"),
+        ("vlm", 'actions: ["query"]', 'actions: ["guess"]', "actions[0]: 'guess' is not one of"),
     ],
 )  # fmt: skip
 def test_wrong_field_is_named(name: str, old: str, new: str, expected: str) -> None:

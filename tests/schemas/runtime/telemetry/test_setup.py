@@ -264,7 +264,7 @@ def test_prometheus_is_read_on_loopback_and_not_after_the_end() -> None:
         "t = o.set_up('vram-runner')\n"
         "from vram_arbiter.schemas.runtime.telemetry import meters\n"
         "meters.count(n.METRIC_GOALS, {n.ATTR_SKILL: 'grab'}, 2)\n"
-        "meters.measure(n.METRIC_CHUNK, 0.3)\n"
+        "for value in (0.3, -0.1, float('nan')): meters.measure(n.METRIC_CHUNK, value)\n"
         f"c = http.client.HTTPConnection('127.0.0.1', {port}, timeout=60)\n"
         "c.request('GET', '/metrics')\n"
         "print(c.getresponse().read().decode())\n"
@@ -279,6 +279,7 @@ def test_prometheus_is_read_on_loopback_and_not_after_the_end() -> None:
     assert 'vram_runner_goals_total{rskill_id="grab"} 2.0' in lines
     assert 'vram_runner_chunk_duration_seconds_bucket{le="0.25"} 0.0' in lines
     assert 'vram_runner_chunk_duration_seconds_bucket{le="0.5"} 1.0' in lines
+    assert "vram_runner_chunk_duration_seconds_count 1.0" in lines
     assert any('service_name="vram-runner"' in line for line in lines)
     assert lines[-1] == "refused"
 
