@@ -17,6 +17,7 @@ from typing import Any, Final, Protocol, Self
 from vram_arbiter.runner.ros2.service_client import action_services
 from vram_arbiter.runner.sensors.dds_thread import DdsThread
 from vram_arbiter.runner.sensors.ros2_dds import (
+    announce,
     dds_problems,
     dds_topic,
     full_topic,
@@ -108,6 +109,7 @@ class ActionServer:
         self._running: set[asyncio.Task[None]] = set()
         self._readers: dict[str, Any] = {}
         self._writers: dict[str, Any] = {}
+        self._node: Any = None  # what tells of it
         self.failed: asyncio.Future[str]
 
     async def __aenter__(self) -> Self:
@@ -133,6 +135,7 @@ class ActionServer:
         )
         self._readers.clear()
         self._writers.clear()
+        self._node = None
 
     # -- DDS
     def _open(self) -> DdsThread:
@@ -153,6 +156,8 @@ class ActionServer:
         )
         told = dds_topic(f"{self.name}/_action/status")
         self._writers["status"] = writer_of(participant, told, STATUS, latched=True)
+        node = "vram_runner_" + self.name.rpartition("/")[2]
+        self._node = announce(participant, node, self._readers.values(), self._writers.values())
         return DdsThread(
             "ros2-action-server",
             participant,
