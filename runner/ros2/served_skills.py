@@ -41,6 +41,8 @@ log = logging.getLogger(__name__)
 
 SERVER_S: Final = 10.0  # for a server to be found, and to accept or reject
 CANCEL_S: Final = 2.0
+WIRE: Final = "its node needs RMW_IMPLEMENTATION=rmw_cyclonedds_cpp"
+"""Other implementations discover our requests and cannot read them."""
 
 
 class ServedSkill(SkillBase):
@@ -145,7 +147,8 @@ class RosAction(ServedSkill):
                 )
         except TimeoutError:
             raise SidecarUnavailable(
-                f"{self._name} has not accepted or rejected a goal within {SERVER_S:g} s"
+                f"{self._name} has not accepted or rejected a goal within {SERVER_S:g} s",
+                hint=WIRE,
             ) from None
         if not answer["accepted"]:
             self._may_run = False
@@ -196,7 +199,7 @@ class RosService(ServedSkill):
         return GoalRejected(f"the server of {self._name} answers that it did not succeed: {why}")
 
     async def _leave(self, client: ServiceClient) -> None:
-        log.error("%s has not answered: the robot may still move", self._name)
+        log.error("%s has not answered: the robot may still move; %s", self._name, WIRE)
 
 
 def service_kind(manifest: RSkillManifest) -> str:
