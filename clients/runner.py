@@ -17,6 +17,7 @@ from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.estop import Stopped, stop
 from vram_arbiter.clients.net.link import is_listening
 from vram_arbiter.clients.net.rpc_client import RpcClient
+from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import (
     BadState,
     GoalRejected,
@@ -132,6 +133,7 @@ class RunnerClient:
             lost=self._lost,
             pushed=self._pushed,
             dropped=self._dropped,
+            request_max_bytes=MESSAGE_MAX_BYTES,
         )
         self._goals: dict[str, Goal] = {}
         self._drop = asyncio.Event()

@@ -133,7 +133,7 @@ async def send(endpoint: str, request: Message, *, timeout_s: float = SEND_S) ->
             f"contact to {endpoint} lost: {reason}", hint="has the episode ended?"
         )
 
-    client = RpcClient(endpoint, program="reasoner", lost=lost)
+    client = RpcClient(endpoint, program="reasoner", lost=lost, request_max_bytes=MESSAGE_MAX_BYTES)
     try:
         reply: Message = await client.exchange(request, timeout_s)
     except TimeoutError:

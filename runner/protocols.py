@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
+from vram_arbiter.runner.safety.violations import Violation
 from vram_arbiter.schemas.errors import EstopRequested, TransientError, VramError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import GripperConvention
@@ -241,9 +242,11 @@ class TickSink(Protocol):
 class SafetyGate(Protocol):
     """Decides on every single action before it reaches a motor."""
 
-    def check(self, action: Action, world: WorldState) -> tuple[Action | None, tuple[str, ...]]:
+    def check(
+        self, action: Action, world: WorldState
+    ) -> tuple[Action | None, tuple[Violation, ...]]:
         """Return the action to apply (possibly clamped within the tolerance) or None, and the
-        violations.
+        violations; with None the first one is the reason.
         """
         ...
 

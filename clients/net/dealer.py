@@ -77,7 +77,7 @@ class Dealer:
         if len(payload) > max_bytes:
             raise MessageTooLarge(
                 f"the request has {len(payload)} bytes, the limit is {max_bytes}",
-                hint="send fewer or smaller pictures",
+                hint="send less in one message",
                 details={"size_bytes": len(payload), "limit_bytes": max_bytes},
             )
         if self._link is None or self._link.state != "open":

@@ -21,13 +21,14 @@ from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.runtime.trust import Program
 
-REQUEST_MAX_BYTES = IMAGE_MESSAGE_MAX_BYTES + 64 * KIB  # our servers refuse more, without `re`
+IMAGES_REQUEST_MAX_BYTES = IMAGE_MESSAGE_MAX_BYTES + 64 * KIB
 
 
 class RpcClient:
     """`lost(reason)` makes the error that requests fail with when contact is lost;
     `pushed(message)` gets what is not a reply, `dropped` is called when a connection ends.
-    `enveloped` as in `Dealer`."""
+    `enveloped` as in `Dealer`. `request_max_bytes`: our server refuses more, without `re`.
+    """
 
     def __init__(
         self,
@@ -38,12 +39,14 @@ class RpcClient:
         pushed: Callable[[Message], None] = lambda message: None,
         dropped: Callable[[], None] = lambda: None,
         enveloped: bool = False,
+        request_max_bytes: int = IMAGES_REQUEST_MAX_BYTES,
     ) -> None:
         self.proven = False
         """Whether the present connection was answered once."""
         self.in_order: bool | None = None if enveloped else False
         """Whether replies come without `re`, to one request at a time; None before the first."""
         self._enveloped = enveloped
+        self._request_max_bytes = request_max_bytes
         self._endpoint = endpoint
         self._program: Program = program
         self._lost = lost
@@ -67,8 +70,9 @@ class RpcClient:
         request_id = next(self._ids)
         answer = self._waiting[request_id] = Answer[Any]()
         try:
-            limit = REQUEST_MAX_BYTES if self.in_order is False else MESSAGE_LIMIT_BYTES
-            if not dealer.send({**request, "id": request_id}, limit):
+            limit = self._request_max_bytes if self.in_order is False else MESSAGE_LIMIT_BYTES
+            message = {"id": 0} | dict(request) | {"id": request_id}  # first: see `leading_id`
+            if not dealer.send(message, limit):
                 raise self._lost("it accepts no more requests; restart it")
             return await answer.within(timeout_s)
         finally:

@@ -30,7 +30,7 @@ from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.connection import Bounds, Connection
 from vram_arbiter.schemas.runtime.endpoints import socket_path
 from vram_arbiter.schemas.runtime.folders import LockFile, socket_folder
-from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, pack, unpack_map
+from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, leading_id, pack, unpack_map
 from vram_arbiter.schemas.runtime.router import Router
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 
@@ -223,7 +223,7 @@ class RouterServer:
             message, size = self._decoded(payload)
             waiting = self._waiting_of(client.peer.uid, size)
         except VramError as error:
-            connection.send(pack(self._on_error(error)))
+            connection.send(pack(self._refusal(payload, error)))
             return within_rate
         if not connection.admitted:
             connection.admit()
@@ -238,6 +238,13 @@ class RouterServer:
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
         return within_rate
+
+    def _refusal(self, payload: bytes | bytearray | Oversize, error: VramError) -> Message:
+        """Return the answer to a message that is not handled, with the id where it begins with
+        one."""
+        answer = self._on_error(error)
+        request_id = None if isinstance(payload, Oversize) else leading_id(payload)
+        return answer if request_id is None else {**answer, "re": request_id}
 
     def _decoded(self, payload: bytes | bytearray | Oversize) -> tuple[Message, int]:
         """The message and its size. Raises MessageTooLarge and BadFrame."""

@@ -346,8 +346,8 @@ def plan(
         lines.append(("estop", f"also by {button} (std_msgs/Bool)"))
     if robot.teleop is not None:
         lines.append(("operator", f"by {robot.teleop.adapter}, on `record` and `takeover`"))
-    if robot.ros_actions:
-        names = ", ".join(robot.ros_actions)
+    if asked := (*robot.ros_actions, *robot.ros_services):
+        names = ", ".join(asked)
         lines.append(("actions", f"by ROS 2 servers, past this runner's gate and motors: {names}"))
     lines += [("NOT KEPT", text) for text in unkept(file, parts, catalogue)]
     lines += [("skill", text) for text in catalogue.summary()]

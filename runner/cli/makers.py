@@ -1,4 +1,4 @@
-"""Makers of a deployment's skills: policies in sidecars, and ROS 2 actions."""
+"""Makers of a deployment's skills: policies in sidecars, ROS 2 actions and services."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.runner.cli.common import sidecars_given
 from vram_arbiter.runner.cli.deployment import DeploymentFile, Parts
 from vram_arbiter.runner.goals.catalogue import Maker
-from vram_arbiter.runner.skills.ros_standins import StandIn
+from vram_arbiter.runner.skills.ros_standins import StandIn, StandIns
 from vram_arbiter.runner.skills.teleop import INTERFACE, Teleop
 from vram_arbiter.schemas.config.robot import RobotEnvironment
 from vram_arbiter.schemas.control import ControlMode
@@ -28,7 +28,9 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
     def make_makers(parts: Parts, arbiter: AsyncClient | None) -> Mapping[Kind, Maker]:
         from vram_arbiter.runner.skills.makers import makers_of
 
-        return makers_of(
+        joints = parts.hal.description.joint_names
+        services = StandIns(service_servers(file.robot), joints, "ros_services")
+        made = makers_of(
             parts.hal.description,
             lambda manifest: parts.gate.for_skill(manifest, ()).limits,
             parts.hal.sent,
@@ -37,6 +39,7 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
             period_s=1.0 / file.robot.rate_hz,
             others={**ros_servers(file.robot), **operators(parts, 1.0 / file.robot.rate_hz)},
         )
+        return {**made, Kind.ROS_SERVICE: services}
 
     return make_makers
 
@@ -45,19 +48,38 @@ def ros_servers(robot: RobotEnvironment) -> dict[str, StandIn]:
     """Return the actions that ROS 2 servers execute, by interface. Raises ConfigError."""
     if not robot.ros_actions:
         return {}
-    need("ros_actions", "cyclonedds", extra="ros2")
-    from vram_arbiter.runner.ros2.action_skill import RosAction
-    from vram_arbiter.runner.sensors.ros2_dds import domain_of
+    domain = _domain("ros_actions")
+    from vram_arbiter.runner.ros2.served_skills import RosAction
 
-    try:
-        domain = domain_of()
-    except ValueError as error:
-        raise ConfigError(f"ros_actions: {error}") from error
     served = StandIn(
         lambda manifest: RosAction(manifest, domain),
         frozenset({ControlMode.JOINT_POSITION, ControlMode.BODY_TWIST}),
     )
     return dict.fromkeys(robot.ros_actions, served)
+
+
+def service_servers(robot: RobotEnvironment) -> dict[str, StandIn]:
+    """Return the services that ROS 2 servers execute, by interface. Raises ConfigError."""
+    if not robot.ros_services:
+        return {}
+    domain = _domain("ros_services")
+    from vram_arbiter.runner.ros2.served_skills import RosService, service_misfit
+
+    served = StandIn(
+        lambda manifest: RosService(manifest, domain), frozenset(ControlMode), service_misfit
+    )
+    return dict.fromkeys(robot.ros_services, served)
+
+
+def _domain(setting: str) -> int:
+    """Return the DDS domain. Raises ConfigError: a wrong number, or Cyclone DDS is missing."""
+    need(setting, "cyclonedds", extra="ros2")
+    from vram_arbiter.runner.sensors.ros2_dds import domain_of
+
+    try:
+        return domain_of()
+    except ValueError as error:
+        raise ConfigError(f"{setting}: {error}") from error
 
 
 def operators(parts: Parts, period_s: float) -> dict[str, StandIn]:

@@ -29,7 +29,7 @@ from vram_arbiter.runner.protocols import (
     SkillEnded,
     Stepped,
 )
-from vram_arbiter.runner.safety.violations import SafetyViolation, check_of
+from vram_arbiter.runner.safety.violations import SafetyViolation, Violation
 from vram_arbiter.schemas.errors import InternalError, LimitExceeded, ModelError, VramError
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
@@ -224,7 +224,7 @@ class SkillSlot:
         checked_s = self._clock.now_s()
         with tracing.span(telemetry.SPAN_SAFETY):
             decision.action, found = active.gate.check(action, world)
-            found = (*found, short) if short else found
+            found = (*found, Violation("skill", short)) if short else found
             self._report(found, withheld=decision.action is None)
         decision.safety_ms = (self._clock.now_s() - checked_s) * 1e3
         problems = decision.violations = tuple(map(str, found))
@@ -237,18 +237,18 @@ class SkillSlot:
             self.total.clamped += bool(problems)
             active.detail = ""
 
-    def _report(self, problems: Sequence[str], *, withheld: bool) -> None:
+    def _report(self, problems: Sequence[Violation], *, withheld: bool) -> None:
         """Tell telemetry of the violations of one action; the first one is why it is withheld."""
         for index, problem in enumerate(problems):
             refused = withheld and index == 0
             about = {
-                telemetry.ATTR_CHECK: check_of(problem),
+                telemetry.ATTR_CHECK: problem.check,
                 telemetry.ATTR_SEVERITY: "error" if refused else "warning",
             }
             meters.count(telemetry.METRIC_SAFETY_VIOLATIONS, {**self.labels, **about})
             tracing.event(telemetry.EVENT_SAFETY_VIOLATION, reason=str(problem), **about)
             if refused:
-                tracing.refused(SafetyViolation(check_of(problem), problem), about)
+                tracing.refused(SafetyViolation(problem.check, problem), about)
 
     # -- actions that never reach the motors
     def input_stale(self, stale: StaleInput) -> Decision:

@@ -29,7 +29,7 @@ NOT_EXECUTED = {
 UNMADE = {
     Kind.VLA: "nothing here makes learned policies",
     Kind.ROS_ACTION: "this runner neither stands in for it nor asks a ROS 2 server",
-    Kind.ROS_SERVICE: "this runner has no ROS 2 service client",
+    Kind.ROS_SERVICE: "only a robot's deployment asks ROS 2 servers",
 }
 MOTION_S = 45.0  # of a goal when neither it nor its manifest says how long
 # before the motion: other models finish and leave, a model loads, the arm goes to its start

@@ -1,6 +1,6 @@
 """Server of one ROS 2 action over DDS, as rmw_cyclonedds speaks it. Needs no ROS installation.
 
-Besides its three services (see `action_client`) an action has two topics, `feedback` and `status`.
+Besides its three services (see `service_client`) an action has two topics, `feedback` and `status`.
 A thread of its own waits for requests; everything else happens on the event loop.
 """
 
@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final, Protocol, Self
 
-from vram_arbiter.runner.ros2.action_client import CANCEL, SERVICES
+from vram_arbiter.runner.ros2.service_client import action_services
 from vram_arbiter.runner.sensors.dds_thread import DdsThread
 from vram_arbiter.runner.sensors.ros2_dds import (
+    announce,
     dds_problems,
     dds_topic,
     full_topic,
@@ -97,8 +98,7 @@ class ActionServer:
         except ValueError as error:
             raise ConfigError(f"the action's name: {error}") from error
         action = action_of(interface)
-        kinds = (f"{action}_SendGoal", f"{action}_GetResult", CANCEL)
-        self._kinds = dict(zip(SERVICES, kinds, strict=True))
+        self._kinds = action_services(interface)
         self._feedback_kind = f"{action}_FeedbackMessage"
         self._domain = domain
         self._accept = accept
@@ -109,6 +109,7 @@ class ActionServer:
         self._running: set[asyncio.Task[None]] = set()
         self._readers: dict[str, Any] = {}
         self._writers: dict[str, Any] = {}
+        self._node: Any = None  # what tells of it
         self.failed: asyncio.Future[str]
 
     async def __aenter__(self) -> Self:
@@ -129,9 +130,12 @@ class ActionServer:
             for task in late:
                 task.cancel()
         await self._thread.stop()
-        await asyncio.to_thread(self._writers["get_result"].wait_for_acks, _duration(LAST_S))
+        await asyncio.to_thread(
+            self._writers["/_action/get_result"].wait_for_acks, _duration(LAST_S)
+        )
         self._readers.clear()
         self._writers.clear()
+        self._node = None
 
     # -- DDS
     def _open(self) -> DdsThread:
@@ -139,7 +143,7 @@ class ActionServer:
 
         participant = DomainParticipant(self._domain)
         for service, kind in self._kinds.items():
-            path = f"{self.name}/_action/{service}"
+            path = self.name + service
             self._writers[service] = writer_of(
                 participant, f"rr{path}Reply", f"{kind}_Response", kept=REQUESTS_KEPT, wait_s=1
             )
@@ -152,6 +156,8 @@ class ActionServer:
         )
         told = dds_topic(f"{self.name}/_action/status")
         self._writers["status"] = writer_of(participant, told, STATUS, latched=True)
+        node = "vram_runner_" + self.name.rpartition("/")[2]
+        self._node = announce(participant, node, self._readers.values(), self._writers.values())
         return DdsThread(
             "ros2-action-server",
             participant,
@@ -170,7 +176,7 @@ class ActionServer:
                 try:
                     request = read(self._kinds[service] + "_Request", cdr_of(sample))
                 except ValueError as error:
-                    log.warning("a request of %s/%s cannot be read: %s", self.name, service, error)
+                    log.warning("a request of %s%s cannot be read: %s", self.name, service, error)
                     continue
                 self._loop.call_soon_threadsafe(self._begin, service, request)
 
@@ -196,9 +202,9 @@ class ActionServer:
 
     async def _answer(self, service: str, request: JsonObject) -> None:
         answers = {
-            "send_goal": self._send_goal,
-            "get_result": self._get_result,
-            "cancel_goal": self._cancel_goal,
+            "/_action/send_goal": self._send_goal,
+            "/_action/get_result": self._get_result,
+            "/_action/cancel_goal": self._cancel_goal,
         }
         reply = await answers[service](request)
         call = {"guid": request["guid"], "seq": request["seq"]}

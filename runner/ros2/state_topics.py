@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from vram_arbiter.clients.runner import RunnerClient
-from vram_arbiter.runner.sensors.ros2_dds import dds_problems, dds_topic, writer_of
+from vram_arbiter.runner.sensors.ros2_dds import announce, dds_problems, dds_topic, writer_of
 from vram_arbiter.runner.sensors.ros2_messages import stamp_of
 from vram_arbiter.runner.sensors.ros2_types import RosMessage, sample_of, write
 from vram_arbiter.runner.sensors.world_state import JOINT_STATE
@@ -27,6 +27,7 @@ log = logging.getLogger(__name__)
 
 FRESH_NS: Final = 1_000_000_000  # an older state is not published
 KEPT: Final = 10
+NODE: Final = "vram_runner_state"
 BASE_FRAME: Final = "base_link"  # REP 105's name of what the base's pose is the pose of
 KINDS: Final = {
     "/joint_states": "sensor_msgs/msg/JointState",
@@ -54,6 +55,7 @@ class StateTopics:
                 )
                 for name, kind in KINDS.items()
             }
+            self._node = announce(participant, NODE, (), self._writers.values())
 
     async def run(self) -> None:
         """Publish until canceled. A runner that does not answer is asked again."""

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final
 
-from vram_arbiter.clients.net.server import VALUES_MAX
 from vram_arbiter.clients.runner import Goal, RunnerClient
 from vram_arbiter.runner.goals.catalogue import START_S
 from vram_arbiter.runner.ros2.action_server import Execution, Status
@@ -34,7 +33,6 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import JsonObject
-from vram_arbiter.schemas.runtime.msgpack_codec import count_values, pack
 
 
 class Code(IntEnum):
@@ -57,7 +55,6 @@ CODES: Final[Mapping[str, Code]] = {
 NOT_SENT: Final[Any] = {
     "trajectory": {"points": {"__all__": {"velocities", "accelerations", "effort"}}, "header": True}
 }
-GOAL_VALUES_MAX: Final = VALUES_MAX - 64  # of the parameters: the message has others beside them
 UNSUPPORTED: Final = ("component_path_tolerance", "component_goal_tolerance")
 
 
@@ -94,7 +91,7 @@ class TrajectoryGoals:
             asked = params_of(goal)
             sent = await self._client.send_goal(
                 self._rskill_id,
-                goal_params=_sendable(asked),
+                goal_params=asked.model_dump(exclude=NOT_SENT),
                 deadline_s=START_S + asked.last_s + asked.arrive_s,
                 goal_id=goal_id,
             )
@@ -120,16 +117,6 @@ def params_of(goal: RosMessage) -> TrajectoryParams:
     tolerances = ("path_tolerance", "goal_tolerance", "goal_time_tolerance")
     named = {"joint_names": goal["trajectory"]["joint_names"], "points": points}
     return checked(TrajectoryParams, {"trajectory": named} | {one: goal[one] for one in tolerances})
-
-
-def _sendable(asked: TrajectoryParams) -> JsonObject:
-    """Return what the runner is sent. Raises BadRequest: it is too long for one message, to which
-    the runner could not reply."""
-    params = asked.model_dump(exclude=NOT_SENT)
-    if count_values(pack(params), GOAL_VALUES_MAX) > GOAL_VALUES_MAX:
-        count = len(asked.trajectory.points)
-        raise BadRequest(f"{count} points are too many for one goal", hint="send several goals")
-    return params
 
 
 async def _positions(client: RunnerClient) -> dict[str, float]:

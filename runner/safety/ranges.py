@@ -37,7 +37,9 @@ class JointRanges:
         if action.control_mode is not ControlMode.JOINT_POSITION:
             return _withheld("form", f"control mode {action.control_mode} is not supported here")
         names = action.joint_names or tuple(self.joint_limits)
-        rows, problems, withheld = [], [], False
+        rows = []
+        clamped: list[Violation] = []
+        withheld: list[Violation] = []
         for row in action.joint_targets or ():
             if len(row) != len(names):
                 return _withheld("form", f"{len(row)} joint targets for {len(names)} joints")
@@ -53,15 +55,15 @@ class JointRanges:
                     said = (
                         f"{name}: {value:.3f} rad is {excess:.3f} outside [{low:.3f}, {high:.3f}]"
                     )
-                    problems.append(Violation("joint_range", said))
-                    withheld |= excess > self.clamp_tolerance_rad
+                    found = withheld if excess > self.clamp_tolerance_rad else clamped
+                    found.append(Violation("joint_range", said))
                 values.append(min(max(value, low), high))
             rows.append(tuple(values))
         if withheld:
-            return None, tuple(problems)
-        if problems:
+            return None, (*withheld, *clamped)
+        if clamped:
             action = action.model_copy(update={"joint_targets": tuple(rows)})
-        return action, tuple(problems)
+        return action, tuple(clamped)
 
 
 def _withheld(check: Check, text: str) -> tuple[None, tuple[Violation, ...]]:

@@ -44,8 +44,3 @@ class SafetyViolation(Exception):
     def __init__(self, check: Check, text: str) -> None:
         super().__init__(text)
         self.violation = Violation(check, text)
-
-
-def check_of(problem: str) -> Check:
-    """Return the check that found a violation; a text without one is the skill's own."""
-    return problem.check if isinstance(problem, Violation) else "skill"

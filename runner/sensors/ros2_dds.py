@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from vram_arbiter.runner.sensors.ros2_types import dds_type, type_hash
+from vram_arbiter.runner.sensors.ros2_types import dds_type, sample_of, type_hash, write
 from vram_arbiter.schemas.errors import ConfigError
 
 DOMAIN_MAX = 232  # the last one whose ports exist
@@ -86,6 +86,28 @@ def writer_of(
         latched=latched,
     )
     return DataWriter(participant, described, qos=quality)
+
+
+def announce(participant: Any, node: str, readers: Iterable[Any], writers: Iterable[Any]) -> Any:
+    """Tell ROS 2 which node has these endpoints, as rmw_dds_common does for `ros2 node list`.
+
+    Return the writer; nodes that start later hear of it as long as it is kept.
+    """
+    kind = "rmw_dds_common/msg/ParticipantEntitiesInfo"
+    told = writer_of(participant, "ros_discovery_info", kind, latched=True)
+    entities = {
+        "node_namespace": "/",
+        "node_name": node,
+        "reader_gid_seq": [_gid(reader) for reader in readers],
+        "writer_gid_seq": [_gid(writer) for writer in writers],
+    }
+    info = {"gid": _gid(participant), "node_entities_info_seq": [entities]}
+    told.write(sample_of(kind, write(kind, info)))
+    return told
+
+
+def _gid(entity: Any) -> dict[str, bytes]:
+    return {"data": entity.guid.bytes}
 
 
 def _qos(

@@ -9,6 +9,7 @@ are refused; `uint8` lists are bytes. Knows no network.
 from __future__ import annotations
 
 import functools
+import re
 import struct
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
@@ -73,6 +74,14 @@ uint32 chunks_total
 """,
 }
 """Goal, result and feedback of each, as an `.action` file has them."""
+SERVICES: Final[Mapping[str, str]] = {
+    "std_srvs/Empty": "---",
+    "std_srvs/SetBool": "bool data\n---\nbool success\nstring message",
+    "std_srvs/Trigger": "---\nbool success\nstring message",
+}
+"""Request and reply of each, as a `.srv` file has them."""
+FILLER: Final = "structure_needs_at_least_one_member"
+"""`uint8` that ROS 2 adds to a message without fields."""
 _OF_ACTIONS: Final[Mapping[str, str]] = {
     "SendGoal_Request": "unique_identifier_msgs/UUID goal_id\n{action}_Goal goal",
     "SendGoal_Response": "bool accepted\nbuiltin_interfaces/Time stamp",
@@ -99,6 +108,7 @@ _NUMBERS: Final[Mapping[str, str]] = {
     "bool": "?", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i",
     "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
 }  # fmt: skip
+_BYTES: Final = {"char": "uint8", "octet": "uint8"}
 _CALL: Final = {"guid": "uint64", "seq": "int64"}
 """What rmw_cyclonedds writes before each request and reply: the client, and its number. It is not
 part of the type, nor of its hash."""
@@ -106,11 +116,12 @@ ITEMS_MAX: Final = 100_000  # of one sequence that is no bytes
 
 
 class Field(NamedTuple):
-    """One field. `length` None: one value, 0: any number of them."""
+    """One field. `length` None: one value, 0: any number of them, or `most` where it is not 0."""
 
     name: str
     base: str
     length: int | None
+    most: int = 0
 
 
 @functools.cache
@@ -141,16 +152,54 @@ def action_of(interface: str) -> str:
 
 
 @functools.cache
+def service_of(interface: str, definition: str = "") -> str:
+    """Make the types of a service known, and return the name of which they are named,
+    `std_srvs/srv/Trigger`.
+
+    `definition`: text of its `.srv` file, for a service that SERVICES lacks. Messages that ROS 2
+    lacks follow it as in a rosbag: 80 `=`, `MSG: package/Type`, fields. Raises ValueError.
+    """
+    from rosbags.interfaces import Nodetype
+    from rosbags.typesys import get_types_from_msg
+    from rosbags.typesys.base import TypesysError
+
+    package, _, name = interface.partition("/")
+    parts = re.split(r"^---\s*$", definition or SERVICES.get(interface, ""), flags=re.MULTILINE)
+    if len(parts) != 2:
+        known = "a line --- between request and reply" if definition else "a definition"
+        raise ValueError(f"{interface} needs {known} in the manifest's ros_integration.definition")
+    filler = [(FILLER, (Nodetype.BASE, ("uint8", 0)))]
+    types: dict[str, Any] = {}
+    try:
+        for part, text in zip(("Request", "Response"), parts, strict=True):
+            own = f"{package}/msg/{name}_{part}"
+            types |= get_types_from_msg(text, own)
+            types[f"{package}/srv/{name}_{part}"] = types.pop(own)
+        typestore().register({kind: ([], of or filler) for kind, (_, of) in types.items()})
+        for part in ("Request", "Response"):
+            type_hash(f"{package}/srv/{name}_{part}")  # looks at every type in it
+    except TypesysError as error:
+        raise ValueError(f"the definition of {interface}: {str(error)[:200]}") from error
+    except KeyError as error:
+        raise ValueError(f"the definition of {interface} lacks that of {error.args[0]}") from error
+    return f"{package}/srv/{name}"
+
+
+@functools.cache
 def fields_of(kind: str) -> tuple[Field, ...]:
-    """Return the fields of a message. None of ours has a sequence with a bound."""
+    """Return the fields of a message."""
     from rosbags.interfaces import Nodetype
 
     found = []
     for name, (node, detail) in typestore().fielddefs[kind][1]:
-        count = None
-        if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        count, most = None, 0
+        if node is Nodetype.ARRAY:
             (_, detail), count = detail
-        found.append(Field(name, detail if isinstance(detail, str) else detail[0], count))
+        elif node is Nodetype.SEQUENCE:
+            (_, detail), most = detail
+            count = 0
+        base = detail if isinstance(detail, str) else detail[0]
+        found.append(Field(name, _BYTES.get(base, base), count, most))
     return tuple(found)
 
 
@@ -239,6 +288,8 @@ def _value(field: Field, value: Any, at: str) -> Any:
             listed = np.array(listed, dtype=base)
     if count not in (0, len(listed)):
         raise ValueError(f"{at}: expected {count} numbers, got {len(listed)}")
+    if field.most and len(listed) > field.most:
+        raise ValueError(f"{at}: expected at most {field.most} items, got {len(listed)}")
     return listed
 
 

@@ -18,6 +18,7 @@ from vram_arbiter.runner.planar import planar_pose
 from vram_arbiter.runner.protocols import RobotDescription, SafetyGate, Stepped
 from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.runner.safety.limits import Kinematics, Limits
+from vram_arbiter.runner.safety.violations import Violation
 from vram_arbiter.runner.sim.config import CONTROL_HZ
 from vram_arbiter.runner.sim.env import SimEnv
 from vram_arbiter.runner.skills.motion import action_of, bounded
@@ -41,7 +42,9 @@ class SimulatedTime:
     gate: RobotGate
     arm: SimEnv
 
-    def check(self, action: Action, world: WorldState) -> tuple[Action | None, tuple[str, ...]]:
+    def check(
+        self, action: Action, world: WorldState
+    ) -> tuple[Action | None, tuple[Violation, ...]]:
         stamp_ns = round(self.arm.time_s * 1e9)
         joints = world.joint_state.model_copy(update={"stamp_ns": stamp_ns})
         return self.gate.check(

@@ -1,7 +1,7 @@
 """Skills that this runner performs itself in place of a ROS 2 server, by interface type.
 
-A `ros_action` without a stand-in is refused before a goal could ask for it, with a list of the
-known ones. `runner.ros2` asks ROS 2 servers, where a deployment names the interface.
+A `ros_action` or `ros_service` without one is refused before a goal could ask for it, with a list
+of the known ones. `runner.ros2` asks ROS 2 servers, where a deployment names the interface.
 """
 
 from __future__ import annotations
@@ -19,19 +19,24 @@ TRAJECTORY = "control_msgs/FollowJointTrajectory"
 
 @dataclass(frozen=True, slots=True)
 class StandIn:
-    """`drives` are the control modes that it sends, which the robot has to take."""
+    """`drives` are the control modes that it sends, which the robot has to take; `misfit` says what
+    else is wrong with a manifest, or nothing."""
 
     make: Callable[[RSkillManifest], Skill]
     drives: frozenset[ControlMode]
+    misfit: Callable[[RSkillManifest], str] = lambda manifest: ""
 
 
 class StandIns:
-    """Maker of `ros_action` skills, with refusals. `joints` are the robot's, for ordered
-    manifests.
+    """Maker of `ros_action` or `ros_service` skills, with refusals. `joints` are the robot's, for
+    ordered manifests; `setting` is the deployment's that names what ROS 2 servers execute.
     """
 
-    def __init__(self, known: Mapping[str, StandIn], joints: Iterable[str]) -> None:
+    def __init__(
+        self, known: Mapping[str, StandIn], joints: Iterable[str], setting: str = "ros_actions"
+    ) -> None:
         self._known = dict(known)
+        self._setting = setting
         self._joints = tuple(joints)
 
     def __call__(self, manifest: RSkillManifest) -> Skill:
@@ -45,7 +50,7 @@ class StandIns:
             known = " and ".join(sorted(self._known)) or "none"
             return (
                 f"this runner stands in for {known}, not for {wanted};"
-                " a deployment's `ros_actions` names what ROS 2 servers execute"
+                f" a deployment's `{self._setting}` names what ROS 2 servers execute"
             )
         for actuator in manifest.actuators_required:
             if actuator.kind not in stand_in.drives:
@@ -54,7 +59,7 @@ class StandIns:
             order = actuator.control_mode_semantics.joint_order or ()
             if missing := [name for name in order if name not in self._joints]:
                 return f"it moves {', '.join(missing)}; the robot has {', '.join(self._joints)}"
-        return ""
+        return stand_in.misfit(manifest)
 
 
 def interface_of(manifest: RSkillManifest) -> str:

@@ -177,6 +177,11 @@ class RobotEnvironment(_Section):
     ] = ()
     """Interfaces of `ros_action` skills that ROS 2 servers execute. Their motion passes neither
     this runner's safety gate nor its emergency stop, which only cancels their goals."""
+    ros_services: tuple[
+        Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$")], ...
+    ] = ()
+    """Interfaces of `ros_service` skills that ROS 2 servers execute, such as `std_srvs/Trigger`. As
+    for `ros_actions`, their motion passes no gate of this runner, and a call cannot be canceled."""
     teleop: TeleopConfig | None = None
     """By it an operator moves the robot (`vram-runner record`, `takeover`); null: by none."""
     task: TaskSpec | None = None

@@ -14,6 +14,8 @@ from vram_arbiter.schemas.defaults import LISTED_MAX, MESSAGE_MAX_BYTES, VALUES_
 from vram_arbiter.schemas.errors import BadFrame, MessageTooLarge
 from vram_arbiter.schemas.plain import JsonMap, Message
 
+HEAD_BYTES = 32  # of a map's header, the key `id` and any whole number: 17 at most
+
 
 def pack(message: JsonMap | list[Message]) -> bytes:
     """Texts that UTF-8 has no bytes for (halves of surrogate pairs: undecodable file names,
@@ -96,6 +98,21 @@ def unpack_map(payload: bytes | bytearray | memoryview, limits: UnpackLimits) ->
             hint="send one msgpack map per message",
         )
     return message
+
+
+def leading_id(payload: bytes | bytearray) -> int | None:
+    """Return the `id` that a request begins with; None for one that begins otherwise.
+
+    Only the first bytes are read: by it a request is refused that is too costly to decode.
+    """
+    unpacker = msgpack.Unpacker(raw=False, strict_map_key=True)
+    unpacker.feed(payload[:HEAD_BYTES])
+    try:
+        unpacker.read_map_header()
+        key, value = unpacker.unpack(), unpacker.unpack()
+    except (ValueError, msgpack.UnpackException):
+        return None
+    return value if key == "id" and type(value) is int else None
 
 
 def count_values(payload: bytes | bytearray | memoryview, values_max: int) -> int:

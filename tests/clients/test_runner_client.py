@@ -11,11 +11,14 @@ from pydantic import TypeAdapter
 
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
+from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import (
+    BadFrame,
     BadRequest,
     BadState,
     FrameStale,
     GoalRejected,
+    MessageTooLarge,
     RunnerUnreachable,
     UnknownSkill,
     VramError,
@@ -33,7 +36,11 @@ class FakeRunner:
         self.sender: Peer | None = None
         self.result: dict[str, Any] | None = None
         self.seen: list[dict[str, Any]] = []
-        self.server = RouterServer(endpoint, lambda error: {"ok": False, "error": error.to_wire()})
+        self.server = RouterServer(
+            endpoint,
+            lambda error: {"ok": False, "error": error.to_wire()},
+            message_max_bytes=MESSAGE_MAX_BYTES,
+        )
 
     @contextlib.asynccontextmanager
     async def serving(self) -> AsyncIterator["FakeRunner"]:
@@ -94,6 +101,24 @@ async def fake() -> AsyncIterator[FakeRunner]:
 async def client(fake: FakeRunner) -> AsyncIterator[RunnerClient]:
     async with RunnerClient(fake.endpoint) as client:
         yield client
+
+
+@pytest.mark.parametrize(
+    ("params", "kind"),
+    [
+        ({"points": [{"positions": [0.1] * 14}] * 1000}, MessageTooLarge),
+        ({"points": [0.1] * 2000}, BadFrame),
+        ({"text": "x" * (MESSAGE_MAX_BYTES - 1000), "more": "x" * 2000}, MessageTooLarge),
+    ],
+    ids=["values", "items", "bytes"],
+)
+async def test_a_goal_that_is_too_long_is_refused_at_once(
+    client: RunnerClient, params: dict[str, Any], kind: type[VramError]
+) -> None:
+    """Regression: the refusal had no id, so the client waited 10 s for a reply to its own."""
+    with pytest.raises(kind):
+        await client.send_goal("ns/grab", goal_params=params)
+    await client.send_goal("ns/grab")
 
 
 async def test_goal_feedback_result(fake: FakeRunner, client: RunnerClient) -> None:

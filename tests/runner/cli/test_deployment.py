@@ -20,6 +20,7 @@ from vram_arbiter.schemas.runtime.folders import LockFile
 pytestmark = pytest.mark.heavy  # the SO-101's kinematics
 
 ROOT = Path(__file__).parents[3]
+SERVICE = ROOT / "tests/schemas/manifest/samples/ros_service.yaml"
 NAVIGATE = ROOT / "configs/rskills/so101-navigate/rskill.yaml"
 GRAB = ROOT / "configs/rskills/so101-grab/rskill.yaml"
 TWIN_FILE = ROOT / "configs/robots/so101-twin.yaml"
@@ -496,3 +497,23 @@ def test_an_action_that_a_ros_server_executes_is_offered_only_if_the_file_says_s
     assert "by ROS 2 servers, past this runner's gate and motors: nav2_msgs/NavigateToPose" in out
     assert here not in out
     assert "not offered" not in out
+
+
+def test_a_service_is_called_only_if_the_file_says_so_and_its_type_is_known(
+    dry_run: DryRun, tmp_path: Path
+) -> None:
+    pytest.importorskip("cyclonedds")
+    text = SERVICE.read_text(encoding="utf-8")
+    text = text.replace("moveit_msgs", "std_srvs").replace("MoveGroup", "Trigger")
+    skill = tmp_path / "rskill.yaml"
+    skill.write_text(text, encoding="utf-8")
+    asked = TWIN + "ros_services: [std_srvs/Trigger]\n"
+    code, out, _ = dry_run(asked, skills=skill)
+    assert code == 0
+    assert "by ROS 2 servers, past this runner's gate and motors: std_srvs/Trigger" in out
+    assert "skill     acme/rskill-aim 0.1.0 (bsd)" in out.splitlines()
+    here = "acme/rskill-aim is not offered: this runner stands in for none, not for std_srvs/Trig"
+    assert here in dry_run(TWIN, skills=skill)[1]
+    skill.write_text(text.replace("Trigger", "Open"), encoding="utf-8")
+    unknown = dry_run(TWIN + "ros_services: [std_srvs/Open]\n", skills=skill)[1]
+    assert "is not offered: std_srvs/Open needs a definition in the manifest's" in unknown

@@ -41,7 +41,7 @@ REASON = {
     Kind.PLAYBOOK: "it is a text for planners",
     Kind.VLA: "nothing here makes learned policies",
     Kind.ROS_ACTION: "nor asks a ROS 2 server",
-    Kind.ROS_SERVICE: "no ROS 2 service client",
+    Kind.ROS_SERVICE: "only a robot's deployment asks",
 }
 
 

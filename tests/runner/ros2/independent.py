@@ -6,6 +6,7 @@ from typing import Any
 
 from cyclonedds.builtin import (
     BuiltinDataReader,
+    BuiltinTopicDcpsParticipant,
     BuiltinTopicDcpsPublication,
     BuiltinTopicDcpsSubscription,
 )
@@ -34,6 +35,19 @@ LATCHED = Qos(
 )
 
 
+Gid_ = struct("rmw_dds_common.msg.dds_.Gid_", data=array[uint8, 16])
+NodeEntitiesInfo_ = struct(
+    "rmw_dds_common.msg.dds_.NodeEntitiesInfo_",
+    node_namespace=str,
+    node_name=str,
+    reader_gid_seq=sequence[Gid_],
+    writer_gid_seq=sequence[Gid_],
+)
+ParticipantEntitiesInfo_ = struct(
+    "rmw_dds_common.msg.dds_.ParticipantEntitiesInfo_",
+    gid=Gid_,
+    node_entities_info_seq=sequence[NodeEntitiesInfo_],
+)
 UUID_ = struct("unique_identifier_msgs.msg.dds_.UUID_", uuid=array[uint8, 16])
 GoalInfo_ = struct("action_msgs.msg.dds_.GoalInfo_", goal_id=UUID_, stamp=Time_)
 CancelRequest_ = struct(
@@ -161,6 +175,32 @@ class Commander:
                             told[name] = quality[Policy.Userdata].data
                 await asyncio.sleep(0.01)
         return told
+
+    async def nodes(self) -> dict[str, tuple[int, int, bool]]:
+        """Return the nodes that participants tell of: how many readers and writers each has, and
+        whether all of these endpoints and the participant were discovered."""
+        topic = Topic(self.participant, "ros_discovery_info", ParticipantEntitiesInfo_)
+        reader: Any = DataReader(self.participant, topic, qos=LATCHED)
+        async with asyncio.timeout(PATIENCE_S):
+            while not (told := valid(reader)):
+                await asyncio.sleep(0.01)
+        seen = {
+            sample.key.bytes
+            for builtin in (
+                BuiltinTopicDcpsParticipant,
+                BuiltinTopicDcpsPublication,
+                BuiltinTopicDcpsSubscription,
+            )
+            for sample in BuiltinDataReader(self.participant, builtin).read(N=1000)
+        }
+        found = {}
+        for info in told:
+            for node in info.node_entities_info_seq:
+                gids = [info.gid, *node.reader_gid_seq, *node.writer_gid_seq]
+                known = {bytes(gid.data) for gid in gids} <= seen
+                counts = len(node.reader_gid_seq), len(node.writer_gid_seq)
+                found[node.node_namespace + node.node_name] = (*counts, known)
+        return found
 
     async def status(self, goal_id: UUID_, expected: int) -> None:
         """Wait until the status topic says so."""

@@ -13,7 +13,7 @@ import pytest
 
 from tests.support.dds import NETWORK
 from vram_arbiter.runner.protocols import Done, Goal, Hold
-from vram_arbiter.runner.ros2.action_skill import RosAction
+from vram_arbiter.runner.ros2.served_skills import RosAction
 from vram_arbiter.runner.sensors.ros2_types import read, write
 from vram_arbiter.schemas.errors import BadRequest, Cancelled, GoalRejected, ModelError
 from vram_arbiter.schemas.manifest import load_manifest
@@ -178,7 +178,7 @@ async def test_a_goal_that_the_server_itself_cancels_is_not_a_success(
     try:
         await skill.start(goal(5.0))
         assert skill._client is not None
-        await skill._client.call("cancel_goal", {"goal_info": {"goal_id": skill._goal_id}})
+        await skill._client.call("/_action/cancel_goal", {"goal_info": {"goal_id": skill._goal_id}})
         with pytest.raises(Cancelled, match="status 5"):
             await ended(skill)
     finally:

@@ -178,3 +178,10 @@ async def test_every_endpoint_tells_the_hash_of_its_type(served_action: Serving)
     assert short["cancel_goalRequest"] == f"typehash=RIHS01_{request};".encode()
     status = "6c1684b00f177d37438febe6e709fc4e2b0d4248dca4854946f9ed8b30cda83e"
     assert short["status"] == f"typehash=RIHS01_{status};".encode()
+
+
+async def test_a_node_is_told_with_its_endpoints(served_action: Serving) -> None:
+    """As `ros2 node list` and `ros2 node info` find it."""
+    async with served_action() as (_, commander):
+        await commander.type_hashes(8)  # all are discovered
+        assert await commander.nodes() == {"/vram_runner_execute_rskill": (3, 5, True)}

@@ -228,7 +228,7 @@ async def test_what_cannot_be_played_ends_with_the_actions_own_codes(
         refused = {
             "unknown joint elbow;": await planner.follow((1.0, (0.0,)), joints=("elbow",)),
             "time_from_start.sec: Input should be less": await planner.follow((601.0, (0.0, 1.3))),
-            "1899 points are too many for one goal": await planner.follow(
+            "more than 12288 values": await planner.follow(
                 *((number / 10, (0.0, 1.35)) for number in range(1, 1900))
             ),
             "an empty one moves nothing": await planner.follow(),

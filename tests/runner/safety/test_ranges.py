@@ -51,6 +51,13 @@ def test_what_is_outside_is_withheld(action: Action, said: str) -> None:
     assert said in problems[0]
 
 
+def test_the_first_violation_is_the_one_that_withholds() -> None:
+    """Regression: a small excess of an earlier joint was told as the reason, with its severity."""
+    allowed, problems = JointRanges(LIMITS).check(joints(1.05, 3.0), WORLD)
+    assert allowed is None
+    assert [problem.split(":")[0] for problem in problems] == ["b", "a"]
+
+
 def test_nothing_moves_on_a_stale_state() -> None:
     stale = WORLD.model_copy(update={"diagnostics": {"joint_state": "stale"}})
     allowed, problems = JointRanges(LIMITS).check(joints(0.0, 0.0), stale)

@@ -7,7 +7,12 @@ import pytest
 pytestmark = pytest.mark.heavy
 pytest.importorskip("rosbags")
 
-from vram_arbiter.runner.sensors.ros2_types import read, type_hash, write  # noqa: E402
+from vram_arbiter.runner.sensors.ros2_types import (  # noqa: E402
+    read,
+    service_of,
+    type_hash,
+    write,
+)
 
 HASHES = {
     "std_msgs/msg/Bool": "feb91e995ff9ebd09c0cb3d2aed18b11077585839fb5db80193b62d74528f6c9",
@@ -37,6 +42,23 @@ HASHES = {
 @pytest.mark.parametrize(("kind", "digest"), HASHES.items())
 def test_hashes_are_those_of_another_implementation(kind: str, digest: str) -> None:
     assert type_hash(kind) == f"RIHS01_{digest}"
+
+
+SERVICES = {
+    "Empty_Request": "458eaf200a3f63d9cc53d19436edebc0c140ef4c93ca75d5bd4ce19fd7759e35",
+    "Empty_Response": "0a2858b3f60df644a61d0fa44cfc923a3d3628e0ad9c8ad8534b1a2c92a413dc",
+    "SetBool_Request": "c62fbb99d94e1b25e8ef9e109f9581956bb1b3361a45a4e5810c36a90d29932e",
+    "SetBool_Response": "d0814e7f7b4880ab77e9c57426c7aa1562ab69f11eef8e2e968812f9cbd0b059",
+    "Trigger_Request": "d010825374ce8918e72bfd826c82603e60f45419e932ea976f807b74a863a199",
+    "Trigger_Response": "2d946c21e2fc3f1e9ca6986a8191d85fcc70097a8bb7771a053564bc47009cdf",
+}
+"""As ROS 2 Jazzy's std_srvs 5.3.6 installs them (`share/std_srvs/srv/*.json`)."""
+
+
+@pytest.mark.parametrize(("kind", "digest"), SERVICES.items())
+def test_hashes_of_services_are_those_that_ros_installs(kind: str, digest: str) -> None:
+    name = service_of(f"std_srvs/{kind.partition('_')[0]}")
+    assert type_hash(f"{name}_{kind.partition('_')[2]}") == f"RIHS01_{digest}"
 
 
 def test_what_ros_does_not_set_to_zero_has_its_default() -> None:

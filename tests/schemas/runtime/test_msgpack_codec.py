@@ -10,7 +10,12 @@ from hypothesis import strategies as st
 
 from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.errors import BadFrame, MessageTooLarge
-from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, count_values, unpack_map
+from vram_arbiter.schemas.runtime.msgpack_codec import (
+    UnpackLimits,
+    count_values,
+    leading_id,
+    unpack_map,
+)
 
 LIMITS = UnpackLimits(message_max_bytes=MIB, values_max=100, keys_max=20, items_max=30)
 
@@ -118,3 +123,26 @@ def test_large_bytes_are_skipped_not_walked() -> None:
     assert count_values(payload, 100) == 5
     assert payload.looks < 20
     assert len(unpack_map(payload, LIMITS)["image"]) == MIB // 2
+
+
+@pytest.mark.parametrize(
+    ("payload", "found"),
+    [
+        (msgpack.packb({"id": 2**53, "op": "goal", "params": [0] * 10_000}), 2**53),
+        (msgpack.packb({"id": 7} | {f"k{n}": 0 for n in range(100_000)})[:40], 7),
+        (msgpack.packb({"op": "goal", "id": 7}), None),
+        (msgpack.packb({"id": "7"}), None),
+        (msgpack.packb({"id": True}), None),
+        (msgpack.packb({"id": "x" * MIB}), None),
+        (msgpack.packb({}), None),
+        (msgpack.packb([1]), None),
+        (b"\x81\xa2\xff\xff\x01", None),
+        (b"\x9f" * 100, None),
+        (b"\xdf\xff", None),
+        (b"", None),
+    ],
+)
+def test_the_id_that_a_request_begins_with_is_read_from_its_first_bytes(
+    payload: bytes, found: int | None
+) -> None:
+    assert leading_id(payload) == found

@@ -1,9 +1,9 @@
-"""Client of one ROS 2 action over DDS, as rmw_cyclonedds speaks it. Needs no ROS installation.
+"""Client of ROS 2 services over DDS, as rmw_cyclonedds speaks them. Needs no ROS installation.
 
-An action is three services (`send_goal`, `get_result`, `cancel_goal`) below `NAME/_action`; a
-service is a topic of requests and one of replies, which name the client and the request. Feedback
-and status topics are not read. A thread of its own waits for replies; calls are awaited on the
-event loop.
+A service is a topic of requests and one of replies, which name the client and the request. An
+action is three services (`send_goal`, `get_result`, `cancel_goal`) below `NAME/_action`; its
+feedback and status topics are not read. A thread of its own waits for replies; calls are awaited on
+the event loop.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
+from collections.abc import Mapping
 from typing import Any, Self
 
 from vram_arbiter.runner.sensors.dds_thread import DdsThread
@@ -26,20 +27,26 @@ SERVICES = ("send_goal", "get_result", "cancel_goal")
 CANCEL = "action_msgs/srv/CancelGoal"
 
 
-class ActionClient:
-    """`async with ActionClient("nav2_msgs/NavigateToPose", "/navigate_to_pose", 0) as client:`
+def action_services(interface: str) -> dict[str, str]:
+    """Return the types of an action's services by their names below its own."""
+    action = action_of(interface)
+    kinds = (f"{action}_SendGoal", f"{action}_GetResult", CANCEL)
+    return {f"/_action/{name}": kind for name, kind in zip(SERVICES, kinds, strict=True)}
 
-    Entering raises ConfigError: a wrong name, or DDS cannot be started.
+
+class ServiceClient:
+    """`async with ServiceClient("/open", {"": "std_srvs/srv/Trigger"}, 0) as client:`
+
+    `kinds`: the types of its services, by what their names have behind `name`. Raises ConfigError:
+    a wrong name; entering: DDS cannot be started.
     """
 
-    def __init__(self, interface: str, name: str, domain: int) -> None:
+    def __init__(self, name: str, kinds: Mapping[str, str], domain: int) -> None:
         try:
             self.name = full_topic(name)
         except ValueError as error:
-            raise ConfigError(f"the action's name: {error}") from error
-        action = action_of(interface)
-        kinds = (f"{action}_SendGoal", f"{action}_GetResult", CANCEL)
-        self._kinds = dict(zip(SERVICES, kinds, strict=True))
+            raise ConfigError(f"interface_name: {error}") from error
+        self._kinds = dict(kinds)
         self._domain = domain
         self._guid = secrets.randbits(63)
         self._sent = 0
@@ -66,7 +73,7 @@ class ActionClient:
                 await self._served.wait()
         except TimeoutError:
             raise SidecarUnavailable(
-                f"no server of the action {self.name} within {timeout_s:g} s",
+                f"no server of {self.name} within {timeout_s:g} s",
                 hint="is it running, on this ROS_DOMAIN_ID and network (CYCLONEDDS_URI)?",
             ) from None
 
@@ -92,7 +99,7 @@ class ActionClient:
 
         participant = DomainParticipant(self._domain)
         for service, kind in self._kinds.items():
-            path = f"{self.name}/_action/{service}"
+            path = self.name + service
             writer = self._writers[service] = writer_of(
                 participant, f"rq{path}Request", f"{kind}_Request", kept=REPLIES_KEPT, wait_s=1
             )
@@ -103,7 +110,7 @@ class ActionClient:
             reader.set_status_mask(DDSStatus.SubscriptionMatched)
         readers, writers = self._readers.values(), self._writers.values()
         return DdsThread(
-            "ros2-action", participant, readers, [*writers, *readers], self._woken, self._failed
+            "ros2-client", participant, readers, [*writers, *readers], self._woken, self._failed
         )
 
     # -- on its thread
@@ -115,10 +122,10 @@ class ActionClient:
                     self._took(service, cdr_of(sample))
 
     def _failed(self, problem: str) -> None:
-        self._loop.call_soon_threadsafe(self._fail, problem)
+        self._loop.call_soon_threadsafe(self._fail, f"DDS failed: {problem}")
 
     def _matched(self) -> bool:
-        """Return whether a server has all three services."""
+        """Return whether a server has all services."""
         counts = [w.get_publication_matched_status().current_count for w in self._writers.values()]
         counts += [
             r.get_subscription_matched_status().current_count for r in self._readers.values()
@@ -129,7 +136,7 @@ class ActionClient:
         try:
             reply = read(self._kinds[service] + "_Response", cdr)
         except ValueError as error:
-            log.warning("a reply of %s/%s cannot be read: %s", self.name, service, error)
+            log.warning("a reply of %s%s cannot be read: %s", self.name, service, error)
             return
         if reply["guid"] == self._guid:  # else it is another client's
             self._loop.call_soon_threadsafe(self._settle, service, reply)
@@ -138,8 +145,9 @@ class ActionClient:
     def _found(self, matched: bool) -> None:
         if matched:
             self._served.set()
-        else:
+        elif self._served.is_set():
             self._served.clear()
+            self._fail("its server is gone")
 
     def _settle(self, service: str, reply: JsonObject) -> None:
         waiting = self._waiting.get((service, reply["seq"]))
@@ -149,4 +157,4 @@ class ActionClient:
     def _fail(self, problem: str) -> None:
         for waiting in self._waiting.values():
             if not waiting.done():
-                waiting.set_exception(SidecarUnavailable(f"{self.name}: DDS failed: {problem}"))
+                waiting.set_exception(SidecarUnavailable(f"{self.name}: {problem}"))
