@@ -112,8 +112,8 @@ def test_the_pandas_scene_vlm_tells_held_from_empty_and_from_another(scenes: ran
             expect("Yes" if held == target else "No", grasped.format(target))
             expect("Yes" if held == other else "No", grasped.format(other))
         assert held == target, "choose another seed"
-    # six questions each; the card gives 98 % over all, 92 % of what is held: shapes of one color are
-    # mixed up
+    # six questions each; the card gives 98 % over all, 92 % while something is held: shapes of one
+    # color are mixed up
     env.close()
     assert len(wrong) <= len(scenes) // 2, wrong
 
