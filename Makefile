@@ -25,7 +25,7 @@ WORKERS ?= 4
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core jetson demo test test-core test-gpu nightly mutation measure lint format \
+.PHONY: help setup setup-core setup-worlds jetson demo test test-core test-gpu nightly mutation measure lint format \
 	chaos sim bench bench-switch schemas docs clean
 
 help: ## this list
@@ -36,6 +36,9 @@ setup: ## environment with everything (.venv)
 
 setup-core: ## environment of the base install (.venv-core)
 	@bash .ci/setup core
+
+setup-worlds: ## LIBERO and MetaWorld, with an older MuJoCo (.venv-worlds)
+	@bash .ci/setup worlds
 
 jetson: ## as root on a Jetson: system packages, Cyclone DDS, NVIDIA's torch: ARGS=--dry-run
 	@bash .ci/jetson $(ARGS)
@@ -52,8 +55,9 @@ test-gpu: setup ## what needs an NVIDIA GPU, alone on it; skipped with the reaso
 test-core: setup-core ## the base install alone, in seconds
 	$(CORE)/pytest -q -n $(WORKERS) $(BY_FILE) -m "not heavy and not e2e and not gpu" $(ARGS)
 
-nightly: setup ## random histories of the engine: HISTORIES=100000 MACHINE=leases SEED=n; long tests
+nightly: setup setup-worlds ## random histories of the engine: HISTORIES=100000 MACHINE=leases SEED=n; long tests
 	$(BIN)/pytest -q -m nightly
+	.venv-worlds/bin/pytest -q -m nightly tests/runner/sim/test_lerobot_worlds.py
 	$(TOOL) tests/nightly/nightly_run.py --histories $(HISTORIES) \
 		$(if $(MACHINE),--machine $(MACHINE)) $(if $(filter-out 0,$(SEED)),--seed $(SEED)) $(ARGS)
 
@@ -94,6 +98,6 @@ docs: setup ## the documentation site in build/site; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 clean: ## remove environments, caches and outputs
-	rm -rf .venv .venv-core build dist out .coverage
+	rm -rf .venv .venv-core .venv-worlds build dist out .coverage
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -15,6 +15,7 @@ from training import (
     detector,
     policy,
     progress,
+    record_counter,
     record_grabs,
     record_progress,
     record_scenes,
@@ -25,6 +26,7 @@ from vram_arbiter.schemas.plain import JsonObject
 
 RECORDERS: Final = {
     "scenes": (record_scenes.record, "labeled frames, for detector and scene VLM"),
+    "counter": (record_counter.record, "labeled frames of the Panda's wrist, for its scene VLM"),
     "grabs": (record_grabs.record, "demonstrations of the scripted expert, for the policy"),
     "progress": (record_progress.record, "grabs, two in five miss, for the progress model"),
 }

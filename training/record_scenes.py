@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -96,22 +97,25 @@ def record(out: Path, count: int, seed: int) -> JsonObject:
 
     Raises OSError when it cannot.
     """
+    with SimEnv() as env:
+        kinematics = ArmKinematics(env.config)
+        return write(out, count, seed, lambda layout: shots(env, kinematics, layout))
+
+
+def write(out: Path, count: int, seed: int, of: Callable[[int], Iterable[Shot]]) -> JsonObject:
+    """Write the first `count` frames of the layouts that follow from `seed`; as `record`."""
     import cv2
 
     (out / "images").mkdir(parents=True, exist_ok=True)
-    written = held = layout = 0
-    with SimEnv() as env, (out / LABELS).open("w", encoding="utf-8") as labels:
-        kinematics = ArmKinematics(env.config)
-        while written < count:
-            for image, label in shots(env, kinematics, seed * 1_000_000 + layout):
-                if written == count:
-                    break
-                file = f"images/{written:06d}_{label['camera']}.png"
-                fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-                if not cv2.imwrite(str(out / file), image[..., ::-1], fast):
-                    raise OSError(f"cannot write {out / file}")
-                labels.write(json.dumps({"file": file, **label}) + "\n")
-                held += label["held"] is not None
-                written += 1
-            layout += 1
+    written = held = 0
+    frames = (shot for layout in itertools.count(seed * 1_000_000) for shot in of(layout))
+    with (out / LABELS).open("w", encoding="utf-8") as labels:
+        for image, label in itertools.islice(frames, count):
+            file = f"images/{written:06d}_{label['camera']}.png"
+            fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+            if not cv2.imwrite(str(out / file), image[..., ::-1], fast):
+                raise OSError(f"cannot write {out / file}")
+            labels.write(json.dumps({"file": file, **label}) + "\n")
+            held += label["held"] is not None
+            written += 1
     return {"frames": written, "held": held}

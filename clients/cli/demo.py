@@ -54,8 +54,7 @@ SEED_MAX = 2**31 - 1
 DETECTOR, VLM, GRAB = "detector", "scene-vlm", "grab"
 ROBOTS = {
     "so101-mobile": {DETECTOR: "so101-detector", VLM: "so101-scene-vlm", GRAB: "so101-grab"},
-    # no scene VLM: the shipped one does not know this gripper
-    "panda-mobile": {DETECTOR: "so101-detector", GRAB: "panda-grab"},
+    "panda-mobile": {DETECTOR: "so101-detector", VLM: "panda-scene-vlm", GRAB: "panda-grab"},
 }
 """Sidecars and their skills, by the robot of `vram-runner sim --robot`."""
 NOTES = {
@@ -234,9 +233,8 @@ async def _episode(programs: Programs, runtime: Path, what: Episode) -> JsonObje
         display = Display()
         display.say(f"{task}{'' if arbiter else ', without an arbiter'}")
         result_file = out / "reasoner.json"
-        unasked = [] if VLM in what.sidecars else ["--scene-vlm", "none"]
         reasoner = await programs.start(
-            "reasoner", "reasoner", "--task", task, "--result", str(result_file.resolve()), *unasked
+            "reasoner", "reasoner", "--task", task, "--result", str(result_file.resolve())
         )
         await _watch(programs, reasoner, client, display, watch)
         truth = await runner.ground_truth()
@@ -255,7 +253,6 @@ async def _episode(programs: Programs, runtime: Path, what: Episode) -> JsonObje
         seed=what.seed, arbiter=arbiter, task=task, story=story, capacity_bytes=capacity,
         events=watch.events, reasoner=outcome, truth=truth,
         target=target, seconds=seconds, detector_resident=watch.detector_held,
-        asked_vlm=VLM in what.sidecars,
     )  # fmt: skip
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     title = (

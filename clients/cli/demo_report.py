@@ -61,16 +61,15 @@ def summarise(
     *, seed: int, arbiter: bool, task: str, story: MemoryStory, capacity_bytes: int,
     events: Sequence[JsonMap],
     reasoner: JsonMap, truth: JsonMap, target: str, seconds: float, detector_resident: bool,
-    asked_vlm: bool = True,
 ) -> JsonObject:  # fmt: skip
-    """The demo's outcome. `completed` needs three witnesses: the simulator, the scene VLM if there
-    is one, and the reasoner."""
+    """The demo's outcome. `completed` needs three witnesses: the simulator, the scene VLM and the
+    reasoner."""
     switches = [event for event in events if event["kind"] == "switch"]
     held = bool(truth.get("held_above_table", {}).get(target))
-    confirmed = bool(reasoner.get("vlm_confirmed")) if asked_vlm else None
+    confirmed = bool(reasoner.get("vlm_confirmed"))
     succeeded = reasoner.get("status") == "success"
     return {
-        "completed": held and confirmed is not False and succeeded,
+        "completed": held and confirmed and succeeded,
         "task": task,
         "seed": seed,
         "arbiter": arbiter,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import importlib.util
 import json
 import os
 import shutil
@@ -27,6 +28,17 @@ from vram_arbiter.schemas.runtime.printable import printable_lines
 
 PROGRAM = "lerobot-eval"
 RESULT = "eval_info.json"
+OWN_ENVIRONMENT = (
+    "it needs mujoco < 3.9, and the extra runner a newer one: install vram-arbiter[sidecars] and"
+    " lerobot[{env}] in an environment of its own, and run this command there"
+)
+PACKAGES = {
+    "pusht": ("gym_pusht", "pip install 'lerobot[pusht]'"),
+    "aloha": ("gym_aloha", "pip install 'lerobot[aloha]'"),
+    "libero": ("libero", OWN_ENVIRONMENT),
+    "metaworld": ("metaworld", OWN_ENVIRONMENT),
+}
+"""Environments of lerobot that are packages apart: the module, and how it is installed."""
 UNQUANTIZED = (Dtype.FP32, Dtype.FP16, Dtype.BF16)
 
 
@@ -76,6 +88,12 @@ def _checked(args: argparse.Namespace) -> str:
     if program is None:
         raise ConfigError(
             f"--env {args.env} needs {PROGRAM}", hint="pip install 'vram-arbiter[sidecars]'"
+        )
+    module, how = PACKAGES.get(args.env, ("lerobot", ""))
+    own = Path(program).parent == Path(sys.executable).parent  # else its packages are not known
+    if own and importlib.util.find_spec(module) is None:
+        raise ConfigError(
+            f"--env {args.env} needs the package {module}", hint=how.format(env=args.env)
         )
     return program
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -309,6 +310,11 @@ def test_a_skill_in_our_own_scene(tmp_path: Path) -> None:
         (["--policy", "expert", "--task", "navigate"], "expert"),
         (["--policy", "random", "--env", "pusht"], "give --skill"),
         (["--skill", "vram-arbiter/so101-navigate", "--env", "pusht"], "no policy of that name"),
+        pytest.param(
+            ["--skill", "vram-arbiter/so101-grab", "--env", "libero"],
+            "in an environment of its own",
+            marks=pytest.mark.skipif(find_spec("libero") is not None, reason="LIBERO is here"),
+        ),
     ],
 )
 def test_mistakes_are_said_in_one_line(

@@ -2,7 +2,6 @@
 
 import random
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -10,20 +9,13 @@ pytest.importorskip("mujoco")
 pytest.importorskip("mink")
 from importlib.util import find_spec
 
-import numpy as np
-
-from vram_arbiter.runner.protocols import Act
+from training.record_counter import MANIFEST, pick
 from vram_arbiter.runner.robots.models import load_model
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment, SimulatedTime
-from vram_arbiter.runner.sim.config import CONTROL_DT_S
 from vram_arbiter.runner.sim.navigate import standoff_pose
 from vram_arbiter.runner.sim.scene import load_mujoco
 from vram_arbiter.runner.sim.worlds import panda_world
-from vram_arbiter.runner.skills.actions import Stepper
-from vram_arbiter.runner.skills.motion import action_of, joint_positions
-from vram_arbiter.runner.skills.wiring import wire_up
 from vram_arbiter.schemas.manifest import load_manifest
-from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.scripted_pick import Phase, ScriptedPickAdapter
 
 pytestmark = [
@@ -32,9 +24,6 @@ pytestmark = [
         find_spec("robosuite") is None, reason="needs robosuite's files: .ci/setup full"
     ),
 ]
-
-CONFIGS = Path(__file__).parents[3] / "configs"
-CHUNKS = 20
 
 
 @pytest.fixture
@@ -49,42 +38,19 @@ def play(world: ArmEnvironment, seed: int) -> list[Phase]:
 
     Observations, chunks, rows and the gate are those of a goal; only the socket is left out.
     """
-    manifest = load_manifest(CONFIGS / "rskills/panda-grab/rskill.yaml")
-    wiring = wire_up(manifest, world.robot, world.robot.rest_pose_rad)
+    manifest = load_manifest(MANIFEST)
     env, rng, policy = world.arm, random.Random(seed), ScriptedPickAdapter(manifest)
     world.reset(seed)
     x, y, _ = env.ground_truth().objects[env.target].position_map
     goal = standoff_pose((x, y), env.config)
     env.place((goal.x_m + 0.02, goal.y_m - 0.02, goal.yaw_rad + rng.uniform(-0.05, 0.05)))
     gate = SimulatedTime(world._gate.for_skill(manifest, ()), env)
-    longest = {
-        name: speed * CONTROL_DT_S * 0.98
-        for name, speed in world.limits_for(manifest).speeds_rad_s.items()
-    }
-    stepper = Stepper(
-        wiring.actions, world.robot, wiring.model, period_s=CONTROL_DT_S, longest=longest
-    )
     phases = []
-    for _ in range(CHUNKS):
-        seen = world.observe(round(env.time_s * 1e9), None)
-        measured = joint_positions(seen, world.robot.joint_names)
-        observation = {
-            "observation.state": np.array(wiring.state.vector(seen, measured, wiring.model)),
-            "observation.images.front": env.render("front"),
-            "task": f"grab the {env.target}",
-        }
-        call = EndpointCall(endpoint="get_action", data={"observation": observation})
-        rows = wiring.actions.rows(policy.run(call)["action"])
+    for asked in pick(world, manifest, policy, env.target):
         phases.append(policy._phase)
-        for row in rows:
-            start = world.sent()
-            step = stepper.step(row, start)
-            assert not step.withheld
-            targets = {name: step.targets.get(name, start[name]) for name in wiring.joints}
-            outcome = Act(action_of(targets, 0, step.twist))
-            action, refused = gate.check(outcome.action, world.observe(0, None))
-            assert action is not None, refused
-            world.step(action)
+        action, refused = gate.check(asked, world.observe(0, None))
+        assert action is not None, refused
+        world.step(action)
     return phases
 
 
@@ -106,6 +72,13 @@ def test_the_scene_has_the_frames_of_the_model_that_contracts_are_solved_on(
     tool = data.site("panda_hand_tcp").xpos
     assert env._data.site("panda_grip_site").xpos == pytest.approx(tool, abs=8e-3)
     assert set(env.seen_objects("front")) == {thing.name for thing in env.layout.objects}
+
+
+def test_the_episodes_video_shows_robot_and_objects(panda: ArmEnvironment) -> None:
+    """Regression: its camera stood behind the kitchen's wall, and the video showed that wall."""
+    panda.arm.reset(0)
+    seen = panda.arm.seen_objects("overview")
+    assert set(seen) == {thing.name for thing in panda.arm.layout.objects}
 
 
 def test_the_base_drives_and_stays_before_the_counter(panda: ArmEnvironment) -> None:

@@ -2,6 +2,7 @@
 that serve them."""
 
 import random
+from importlib.util import find_spec
 
 import pytest
 
@@ -9,10 +10,12 @@ from tests.support.paths import CONFIGS
 from vram_arbiter.schemas.manifest import load_manifest
 from vram_arbiter.schemas.sidecar import DetectOp, QueryOp
 from vram_arbiter.sidecars.adapters.choose import make_adapter
+from vram_arbiter.sidecars.adapters.scripted_pick import ScriptedPickAdapter
 from vram_arbiter.sidecars.weights import resolve
 
 pytest.importorskip("mujoco")
 from tests.support.tabletop import NAMES, photo, run_expert
+from training import record_counter
 from vram_arbiter.runner.sim.env import SimEnv
 from vram_arbiter.runner.sim.expert import GrabExpert
 from vram_arbiter.runner.sim.kinematics import ArmKinematics
@@ -81,6 +84,40 @@ def test_the_scene_vlm_tells_held_from_empty_and_from_another(scenes: range):
     assert len(wrong) <= len(scenes) // 3, wrong
 
 
+@UNSEEN
+def test_the_pandas_scene_vlm_tells_held_from_empty_and_from_another(scenes: range):
+    pytest.importorskip("mink")
+    if find_spec("robosuite") is None:
+        pytest.skip("needs robosuite's files: .ci/setup full")
+    adapter, wrong = adapter_of("panda-scene-vlm"), []
+    manifest = load_manifest(record_counter.MANIFEST)
+    world = record_counter.panda_world(None)
+    env = world.arm
+
+    def expect(word: str, question: str) -> None:
+        op = QueryOp(op="query", image=photo(env, "wrist"), question=question, max_new_tokens=32)
+        if not (answer := adapter.run(op)["answer"]).startswith(word):
+            wrong.append(f"{question} {answer}")
+
+    grasped = "Has the robot gripper grasped the {}?"
+    for seed in scenes:
+        for skill in (record_counter.missing(random.Random(seed), manifest), manifest):
+            world.reset(seed)
+            target, other = env.layout.objects[0].name, env.layout.objects[1].name
+            expect("The gripper is empty", "What is the gripper holding?")
+            record_counter.stand_before(env, target, random.Random(seed))
+            for action in record_counter.pick(world, skill, ScriptedPickAdapter(skill), target):
+                world.step(action)
+            held = env.held_object()
+            expect("Yes" if held == target else "No", grasped.format(target))
+            expect("Yes" if held == other else "No", grasped.format(other))
+        assert held == target, "choose another seed"
+    # six questions each; the card gives 98 % over all, 92 % while something is held: shapes of one
+    # color are mixed up
+    env.close()
+    assert len(wrong) <= len(scenes) // 2, wrong
+
+
 def test_the_shipped_models_are_small():
     """They are in the wheel and in the repository."""
     sizes = {
@@ -88,5 +125,5 @@ def test_the_shipped_models_are_small():
         for folder in (CONFIGS / "models").iterdir()
         if folder.is_dir()
     }
-    assert len(sizes) == 4
+    assert len(sizes) == 5
     assert max(sizes.values()) < 8_000_000
