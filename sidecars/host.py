@@ -17,7 +17,6 @@ from vram_arbiter.clients.net.server import RouterServer, path_of
 from vram_arbiter.schemas.errors import NoGpu, VramError
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime import procfs
-from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.base import ModelCall
 from vram_arbiter.sidecars.device.capacity import leased_gpu
 from vram_arbiter.sidecars.model_main import AdapterFor
@@ -180,8 +179,7 @@ class SidecarHost:
             return {
                 "ok": True
             }  # a model that is not resident has nothing to forget, and no reason to load
-        fresh_s = None if isinstance(call, EndpointCall) else call.fresh_s
-        answer: Message = (await residency.run(name, call.token, message, fresh_s=fresh_s))[
+        answer: Message = (await residency.run(name, call.token, message, fresh_s=call.fresh_s))[
             "answer"
         ]
         return answer

@@ -297,6 +297,34 @@ def test_a_history_takes_every_control_step_or_refuses(
     np.testing.assert_array_equal(np.stack(alone), expected, "each of them is a control step")
 
 
+@pytest.mark.parametrize("name", ["diffusion", "tdmpc", "act ensembling"])
+def test_a_call_afresh_depends_on_no_other_one(
+    checkpoint: Callable[[str], Weights], name: str
+) -> None:
+    """Robots of other projects share a policy: the answer to one was smoothed with another's."""
+    import numpy as np
+    import torch
+
+    adapter = load_policy(name, checkpoint(name))
+    length, _ = begin(adapter)
+    steps = observations(6)
+
+    def afresh(observation: dict[str, Any]) -> Any:
+        torch.manual_seed(SEED)
+        data = {"observation": observation}
+        answer = adapter.run(EndpointCall(endpoint="get_action", data=data, afresh=True))
+        assert answer["n_obs_steps"] == length
+        return answer["action"]
+
+    torch.manual_seed(SEED)
+    first = ask(adapter, steps[0])
+    ask(adapter, history(steps, 3, length))
+    np.testing.assert_array_equal(afresh(steps[0]), first, "as the first of an episode")
+    with_history = afresh(history(steps, 4, length))
+    np.testing.assert_array_equal(afresh(history(steps, 4, length)), with_history)
+    assert length == 1 or (afresh(steps[4]) != with_history).any(), "what it saw before counts"
+
+
 def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]) -> None:
     """Its cache takes the observations after its own actions: one too few or too many, and all
     later actions would be others than lerobot's.
@@ -337,6 +365,10 @@ def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]
     policy._encode_frames = encode
     torch.manual_seed(SEED)
     np.testing.assert_array_equal(ask(adapter, steps[0]), expected[:4], "a new episode")
+    with pytest.raises(BadRequest, match="has to see the step after each action"):
+        adapter.run(
+            EndpointCall(endpoint="get_action", data={"observation": steps[0]}, afresh=True)
+        )
     adapter.load("meta")
     meta = [sum(p.nbytes for p in network.parameters()) for network in adapter.networks]
     assert meta == sizes
