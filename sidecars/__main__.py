@@ -113,6 +113,8 @@ def settings_from(flags: argparse.Namespace) -> Settings:
     manifest, weights = read_model(wanted.rskill, wanted.configs)
     entry, device, endpoint = wanted.footprint(manifest), wanted.device, _endpoint(flags)
     need_gpu(manifest, device)
+    if wanted.door is not None:
+        wanted.door.check(manifest)
     same = {name: getattr(flags, name) for name in _SETTINGS}
     return Settings(
         **same,
@@ -128,11 +130,11 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         stands_for=entry.stands_for,
         throttle_bytes_per_s=entry.throttle,
         evictable=not flags.pinned,
-        door=_door(flags, manifest),
+        door=wanted.door,
     )
 
 
-def _door(flags: argparse.Namespace, manifest: RSkillManifest) -> Door | None:
+def _door(flags: argparse.Namespace) -> Door | None:
     """Return the door that the flags ask for. Raises ConfigError."""
     if flags.door is None:
         if flags.listen or flags.offer or flags.door_keys:
@@ -140,7 +142,7 @@ def _door(flags: argparse.Namespace, manifest: RSkillManifest) -> Door | None:
         return None
     uid = os.getuid()
     offered = tuple(program_endpoint(name, os.environ, uid) for name in flags.offer)
-    return door_of(flags.door, flags.listen, offered, flags.door_keys, manifest)
+    return door_of(flags.door, flags.listen, offered, flags.door_keys)
 
 
 def wanted_from(flags: argparse.Namespace, adapter_for: AdapterFor) -> Wanted:
@@ -170,6 +172,7 @@ def wanted_from(flags: argparse.Namespace, adapter_for: AdapterFor) -> Wanted:
         footprint=footprint,
         allow_noncommercial=flags.allow_noncommercial,
         adapter_for=adapter_for,
+        door=_door(flags),
     )
 
 

@@ -29,21 +29,25 @@ _LOOPBACK: Final = re.compile(r"(?:127\.0\.0\.1|localhost):([0-9]{1,5})")
 
 @dataclass(frozen=True, slots=True)
 class Door:
-    """One door. `offered`: endpoints of other sidecars that its clients may choose; `keys`: a file
-    of API keys, one a line."""
+    """One door. `offered`: endpoints of other sidecars that its clients may choose; `keys`: one of
+    them has to be sent, if there are any."""
 
     protocol: Protocol
     port: int
     offered: tuple[str, ...] = ()
-    keys: Path | None = None
+    keys: tuple[bytes, ...] = ()
+
+    def check(self, manifest: RSkillManifest) -> None:
+        """Raise ConfigError for a model that the protocol has no words for."""
+        if manifest.kind is not Kind.VLA:
+            raise ConfigError(
+                f"{manifest.name} is a {manifest.kind}, --door {self.protocol} serves policies",
+                hint="leave out --door",
+            )
 
 
 def door_of(
-    protocol: Protocol,
-    listen: str | None,
-    offered: tuple[str, ...],
-    keys: Path | None,
-    manifest: RSkillManifest,
+    protocol: Protocol, listen: str | None, offered: tuple[str, ...], keys: Path | None
 ) -> Door:
     """Return the door that the flags describe. Raises ConfigError."""
     found = _LOOPBACK.fullmatch(listen or "")
@@ -52,14 +56,26 @@ def door_of(
             f"--door needs --listen 127.0.0.1:PORT, not {listen}",
             hint="a robot of another machine comes through ssh -L PORT:127.0.0.1:PORT",
         )
-    if manifest.kind is not Kind.VLA:
-        raise ConfigError(f"{manifest.name} is a {manifest.kind}: --door serves policies")
-    if (keys is not None) != (protocol == "openpi") and keys is not None:
-        raise ConfigError(f"--door-keys is for --door openpi: {protocol}'s clients send no key")
-    if offered and protocol != "lerobot":
-        raise ConfigError(f"--offer is for --door lerobot: {protocol}'s clients choose no policy")
+    if (offered and protocol != "lerobot") or (keys is not None and protocol != "openpi"):
+        raise ConfigError(
+            f"--door {protocol} has no {'choice of policies' if offered else 'API keys'}",
+            hint="--offer is for lerobot, --door-keys is for openpi",
+        )
     need(f"--door {protocol}", *PACKAGES[protocol], extra="doors")
-    return Door(protocol, int(found[1]), offered, keys)
+    return Door(protocol, int(found[1]), offered, _keys_of(keys) if keys is not None else ())
+
+
+def _keys_of(file: Path) -> tuple[bytes, ...]:
+    """Return the API keys of a file, one a line. Raises ConfigError."""
+    try:
+        keys = tuple(line.strip() for line in file.read_bytes().splitlines() if line.strip())
+    except OSError as error:
+        raise ConfigError(
+            f"the keys of {file} cannot be read: {error.strerror}", hint="see --door-keys"
+        ) from error
+    if not keys:
+        raise ConfigError(f"{file} has no key", hint="write one a line, or leave out --door-keys")
+    return keys
 
 
 @contextlib.asynccontextmanager
@@ -81,10 +97,10 @@ async def opened(
 
             await stack.enter_async_context(lerobot_async.served(path, offers))
         else:
-            from vram_arbiter.sidecars.doors.openpi import keys_of, served
+            from vram_arbiter.sidecars.doors import openpi
 
             await stack.enter_async_context(
-                served(path, offers.clients[0], manifest, keys_of(door.keys))
+                openpi.served(path, offers.clients[0], manifest, door.keys)
             )
         path.chmod(0o660)
         await stack.enter_async_context(on_port(door.port, path, CONNECTIONS_MAX))

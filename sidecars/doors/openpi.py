@@ -22,7 +22,7 @@ from aiohttp import web
 from vram_arbiter.clients.net.server import IMAGES_MAX_BYTES
 from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.clients.sidecar.policy import PolicyClient
-from vram_arbiter.schemas.errors import BadFrame, BadRequest, ConfigError, InternalError, VramError
+from vram_arbiter.schemas.errors import BadFrame, BadRequest, InternalError, VramError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
@@ -35,21 +35,6 @@ _STATE, _IMAGES, _TASK = "observation.state", "observation.images.", "task"
 _TEXTS: Final = ("prompt", "task")
 _REASON_MAX_BYTES: Final = 123  # of a websocket's close
 _log = logging.getLogger("sidecars")
-
-
-def keys_of(file: Path | None) -> tuple[bytes, ...]:
-    """Return the API keys of a file, one a line; none without a file. Raises ConfigError."""
-    if file is None:
-        return ()
-    try:
-        keys = tuple(line.strip() for line in file.read_bytes().splitlines() if line.strip())
-    except OSError as error:
-        raise ConfigError(
-            f"the keys of {file} cannot be read: {error.strerror}", hint="see --door-keys"
-        ) from error
-    if not keys:
-        raise ConfigError(f"{file} has no key", hint="write one a line, or leave out --door-keys")
-    return keys
 
 
 @contextlib.asynccontextmanager
