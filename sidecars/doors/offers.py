@@ -12,6 +12,7 @@ from vram_arbiter.schemas.sidecar import PingResult
 FRESH_S: Final = 5.0
 """How old an observation may be when a model begins to look at it. A robot that waits for a load
 longer than that is to look again: what it saw may have moved."""
+PING_S: Final = 5.0  # of a sidecar that is offered and does not run
 
 
 class Offers:
@@ -29,7 +30,7 @@ class Offers:
         offered = []
         for client in self.clients:
             with contextlib.suppress(SidecarUnavailable):
-                identity = await client.ping()
+                identity = await client.ping(timeout_s=PING_S)
                 if wanted in _names(identity):
                     return client
                 offered.append(identity["rskill"])

@@ -179,14 +179,10 @@ class Peer:
         self.messages = importlib.import_module("lerobot.transport.services_pb2")
         self.stub = services.AsyncInferenceStub(self.channel)
 
-    def instruct(self, config: Any) -> str:
-        return self._status(
-            lambda: self.stub.SendPolicyInstructions(
-                self.messages.PolicySetup(
-                    data=config if isinstance(config, bytes) else pickle.dumps(config)
-                )
-            )
-        )
+    def instruct(self, config: Any, **options: Any) -> str:
+        data = config if isinstance(config, bytes) else pickle.dumps(config)
+        setup = self.messages.PolicySetup(data=data)
+        return self._status(lambda: self.stub.SendPolicyInstructions(setup, **options))
 
     def observe(self, chunks: Iterator[tuple[int, bytes]]) -> str:
         kind = self.messages.Observation
@@ -217,6 +213,8 @@ class Touches:
 def test_attackers_are_refused_while_a_robot_is_served(
     make_client: Callable[..., Any], door: Served, tmp_path: Path
 ) -> None:
+    import grpc
+
     client = make_client()
     mark = tmp_path / "ran"
     with at_work(client) as robot:
@@ -230,6 +228,8 @@ def test_attackers_are_refused_while_a_robot_is_served(
         assert peer.instruct(b"no pickle").startswith("INVALID_ARGUMENT: bad_request")
         assert peer.instruct(pickle.dumps([1])).startswith("INVALID_ARGUMENT: bad_request")
         assert peer.instruct(bytes(5 * MIB)).startswith("RESOURCE_EXHAUSTED"), "gRPC's own limit"
+        bomb = peer.instruct(bytes(64 * MIB), compression=grpc.Compression.Gzip)
+        assert bomb.startswith("RESOURCE_EXHAUSTED: Decompressed message")
         assert peer.instruct(client.policy_config) == "OK"
         for data, status in (
             (hostile, "INVALID_ARGUMENT: bad_request: a pickle that names 'posix.system'"),

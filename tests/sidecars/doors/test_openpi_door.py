@@ -123,6 +123,7 @@ def test_an_evicted_model_comes_back_for_the_next_observation(
         asking = threading.Thread(target=lambda: answers.append(client.infer(seen())))
         asking.start()
         until(lambda: door.ask(endpoint="ping").get("wanted"))
+        assert client._ws.ping().wait(PATIENCE_S), "a client without it hangs up"
         assert not answers
     asking.join(PATIENCE_S)
     assert answers[0]["actions"].shape == (ROWS, JOINTS)
