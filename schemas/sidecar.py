@@ -12,11 +12,11 @@ Endpoint family (policy)             {"endpoint": "ping" | "load" | "reset" | "g
                                      {"error": "Type: message"}, as the field's clients expect
 
 `detect`, `query`, `score` and `get_action` may carry "fresh_s": pictures that had to wait longer
-(for the GPU, a load, another request) are not looked at. Every request may carry "id" (echoed as "re": a DEALER may
-have several under way; REQ clients leave it out), "token" ([epoch, serial]: refuse with `evicted`
-unless it is the sidecar's current one) and "traceparent". Images are PNG or JPEG bytes of RGB,
-and a video is a list of them. Arrays are `{"__ndarray_class__": true, "as_npy": bytes}` (numpy's
-.npy format, pickle never allowed).
+(for the GPU, a load, another request) are not looked at. Every request may carry "id" (echoed as
+"re": a DEALER may have several under way; REQ clients leave it out), "token" ([epoch, serial]:
+refuse with `evicted` unless it is the sidecar's current one) and "traceparent". Images are PNG or
+JPEG bytes of RGB, and a video is a list of them. Arrays are
+`{"__ndarray_class__": true, "as_npy": bytes}` (numpy's .npy format, pickle never allowed).
 
 `get_action` answers the actions that are to be played before it is asked again, or with
 "whole_chunk" all that the policy predicted; it may carry "rtc", what its chunk shall continue. A

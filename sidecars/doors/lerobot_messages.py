@@ -131,7 +131,7 @@ def _part(value: float | Sequence[float]) -> bytes:
     return pickle.dumps(value, _PROTOCOL)[2:-1]
 
 
-def _fields(data: bytes, kind: str) -> dict[Any, Any]:
+def _fields(data: bytes, kind: str) -> Mapping[Any, Any]:
     """Return the fields of the one object of class `kind` that a pickle holds."""
     value = pickles.read(data, {f"{_HELPERS}.{kind}": pickles.Record})
     if not isinstance(value, pickles.Record):

@@ -93,8 +93,7 @@ class _Door:
         return socket
 
     async def _greet(self, socket: web.WebSocketResponse) -> None:
-        """Load the model, then send the metadata: as at openpi's server, who is greeted is
-        served."""
+        """Load the model, then send the metadata: openpi's server listens once it has loaded."""
         try:
             await self._sidecar.load()
             await socket.send_bytes(msgpack.packb(metadata(self._manifest)))

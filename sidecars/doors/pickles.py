@@ -53,15 +53,12 @@ _COUNT_BYTES: Final = 8
 
 
 class Record:
-    """One object of a class that the caller's table names."""
+    """One object of a class that the caller's table names, and its fields."""
 
-    def __init__(self) -> None:
-        self.fields: dict[Any, Any] = {}
+    fields: Mapping[Any, Any] = {}
 
     def build(self, state: Any) -> None:
-        if not isinstance(state, dict):
-            raise ValueError("an object without a map of fields")
-        self.fields = state
+        self.fields = _of(dict, state)
 
 
 class Array:
