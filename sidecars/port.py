@@ -45,6 +45,8 @@ async def on_port(
                 await _pass_on(reader, writer, path)
         except OSError as error:
             _log.warning("a connection to port %d ended: %s", port, error)
+        except asyncio.CancelledError:
+            pass  # the port ends; asyncio's streams take a canceled callback for a defect
         finally:
             passing.discard(task)
             writer.close()
