@@ -1,7 +1,7 @@
 """lerobot's asynchronous inference at a unix socket: gRPC, for its `robot_client` as it is.
 
-Each connection is one robot, known by the name of its end (`sidecars.port`). Differences to
-lerobot's server: several robots at once; a policy is chosen from what is offered, never loaded
+Each connection is one robot, known by the name of its end (`sidecars.port`). gRPC gives the clients
+of one process one connection, and so one robot. Differences to lerobot's server: several robots at once; a policy is chosen from what is offered, never loaded
 from where a robot says; pickles are read as data (`pickles`); what fails is told. Statuses are
 such that gRPC's clients do not repeat the request behind the robot's back.
 """
@@ -11,7 +11,6 @@ import contextlib
 import functools
 import logging
 import runpy
-import time
 from collections.abc import AsyncIterable, AsyncIterator, Callable, Mapping
 from importlib.metadata import distribution
 from pathlib import Path
@@ -26,6 +25,7 @@ from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.errors import (
     BadRequest,
     BadState,
+    CallerError,
     FrameStale,
     LimitExceeded,
     MessageTooLarge,
@@ -46,13 +46,15 @@ SERVICE: Final = "transport.AsyncInference"
 WAIT_S: Final = 2.0
 """How long a request for actions waits for an observation, as at lerobot's server."""
 STREAM_S: Final = 10.0  # how long one observation may take to arrive
-ROBOTS_MAX: Final = 16  # as many as connections
+REFUSED_S: Final = 0.5
+"""How long a request that is wrong waits for its refusal: the next one comes no sooner."""
 REQUESTS_MAX: Final = 256  # at a time, of all robots
 MESSAGE_MAX_BYTES: Final = 4 * MIB  # lerobot's clients send 2 MiB at most
 DETAILS_MAX_CHARS: Final = 1000  # they travel in a header
 _OPTIONS: Final = (
     ("grpc.max_receive_message_length", MESSAGE_MAX_BYTES),
-    ("grpc.max_concurrent_streams", 8),
+    ("grpc.max_concurrent_streams", 3),  # a robot has two
+    ("grpc.http2.bdp_probe", 0),  # else it reads megabytes ahead of each stream
     ("grpc.server_handshake_timeout_ms", 5000),
     ("grpc.max_connection_idle_ms", 600_000),
 )
@@ -66,6 +68,7 @@ _STATUSES: Final[Mapping[type[VramError], grpc.StatusCode]] = {
     ModelError: grpc.StatusCode.INTERNAL,
 }
 """All others: ABORTED. A client repeats UNAVAILABLE and DEADLINE_EXCEEDED without a word."""
+_ENDS: Final = Path("/proc/self/net/unix")
 _BEGIN, _END = 1, 3  # of TransferState
 _log = logging.getLogger("sidecars")
 
@@ -90,7 +93,6 @@ class _Door:
         self._messages = _messages()
 
     async def ready(self, request: Any, context: Any) -> Any:
-        self._robots.pop(context.peer(), None)
         return self._messages.Empty()
 
     async def instruct(self, request: Any, context: Any) -> Any:
@@ -98,23 +100,28 @@ class _Door:
         asked = instructions_of(request.data)
         sidecar = await self._offers.find(asked.skill)
         await sidecar.load()
-        self._robots.pop(context.peer(), None)
-        if len(self._robots) >= ROBOTS_MAX:  # others have hung up, which gRPC does not tell
-            del self._robots[min(self._robots, key=lambda peer: self._robots[peer].used_at)]
+        self._forget_gone()
         self._robots[context.peer()] = Robot(asked, sidecar)
         _log.info("%s asks for %s", context.peer(), asked.skill)
         return self._messages.Empty()
+
+    def _forget_gone(self) -> None:
+        """Forget robots whose connection has ended, which gRPC does not tell: the kernel lists the
+        names of all ends."""
+        ends = set(_ENDS.read_text(encoding="ascii", errors="replace").split())
+        gone = [peer for peer in self._robots if f"@{peer.rpartition(':')[2]}" not in ends]
+        for peer in gone:
+            del self._robots[peer]
 
     async def observe(self, chunks: AsyncIterable[Any], context: Any) -> Any:
         robot = self._robot(context)
         try:
             async with asyncio.timeout(STREAM_S), robot.receiving:
-                data = await _joined(chunks)
+                robot.offer(observation_of(await _joined(chunks), robot.asked))
         except TimeoutError:
             raise LimitExceeded(
                 f"an observation that takes longer than {STREAM_S:g} s", hint="send less"
             ) from None
-        robot.offer(observation_of(data, robot.asked))
         return self._messages.Empty()
 
     async def get_actions(self, request: Any, context: Any) -> Any:
@@ -138,24 +145,26 @@ class _Door:
                 "this connection has sent no instructions",
                 hint="start the robot client again: it sends them first",
             )
-        robot.used_at = time.monotonic()
         return robot
 
 
 async def _joined(chunks: AsyncIterable[Any]) -> bytes:
     """Return the bytes of one observation. Raises BadRequest, LimitExceeded."""
     data = bytearray()
-    async for chunk in chunks:
-        if chunk.transfer_state == _BEGIN:
-            data.clear()
-        data += chunk.data
-        if len(data) > IMAGES_MAX_BYTES:
-            raise LimitExceeded(
-                f"an observation of more than {IMAGES_MAX_BYTES} bytes",
-                hint="send smaller pictures",
-            )
-        if chunk.transfer_state == _END:
-            return bytes(data)
+    try:
+        async for chunk in chunks:
+            if chunk.transfer_state == _BEGIN:
+                data.clear()
+            data += chunk.data
+            if len(data) > IMAGES_MAX_BYTES:
+                raise LimitExceeded(
+                    f"an observation of more than {IMAGES_MAX_BYTES} bytes",
+                    hint="send smaller pictures",
+                )
+            if chunk.transfer_state == _END:
+                return bytes(data)
+    finally:
+        data.clear()  # a refusal's traceback would hold it until the collector runs
     raise BadRequest("an observation without its end", hint="send what robot_client sends")
 
 
@@ -171,22 +180,26 @@ def _handlers(door: _Door) -> Any:
     return grpc.method_handlers_generic_handler(
         SERVICE,
         {
-            name: make(_told(answer), request.FromString, reply.SerializeToString)
+            name: make(_told(answer, reply), request.FromString, reply.SerializeToString)
             for name, (make, answer, request, reply) in methods.items()
         },
     )
 
 
-def _told(answer: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a handler whose typed errors are statuses."""
+def _told(answer: Callable[..., Any], reply: Callable[[], Any]) -> Callable[..., Any]:
+    """Return a handler whose typed errors are statuses, with an empty `reply`."""
 
-    @functools.wraps(answer)
     async def answered(request: Any, context: Any) -> Any:
         try:
             return await answer(request, context)
-        except VramError as error:
+        except VramError as error:  # its traceback holds what was sent: only words are kept
             status = _STATUSES.get(type(error), grpc.StatusCode.ABORTED)
-            await context.abort(status, f"{error.code}: {error}"[:DETAILS_MAX_CHARS])
+            details = f"{error.code}: {error}"[:DETAILS_MAX_CHARS]
+            wait_s = REFUSED_S if isinstance(error, CallerError) else 0.0
+        await asyncio.sleep(wait_s)
+        context.set_code(status)  # `abort` would keep the request until the collector runs
+        context.set_details(details)
+        return reply()
 
     return answered
 

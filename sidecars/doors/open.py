@@ -17,6 +17,7 @@ from vram_arbiter.clients.net.server import path_of
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.runtime.extras import need
+from vram_arbiter.schemas.runtime.heap import give_back_freed_memory
 from vram_arbiter.sidecars.doors.offers import Offers
 from vram_arbiter.sidecars.port import on_port
 
@@ -86,6 +87,7 @@ async def opened(
 
     Raises ConfigError for a port that cannot be had.
     """
+    give_back_freed_memory()
     path = path_of(endpoint).with_suffix(f".{door.protocol}")
     path.unlink(missing_ok=True)  # of a process that was killed: the endpoint is ours alone
     offers = Offers((endpoint, *door.offered), timeout_s)

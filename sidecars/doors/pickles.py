@@ -19,8 +19,8 @@ from typing import Any, Final
 from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.schemas.errors import BadRequest, LimitExceeded, VramError
 
-OPCODES_MAX: Final = 10_000
-"""Instructions of one pickle, those of its tensors included: 25 ms of one core. An observation of
+OPCODES_MAX: Final = 2000
+"""Instructions of one pickle, those of its tensors included: 5 ms of one core. An observation of
 60 joints and 4 cameras has 500."""
 _VALUES: Final = frozenset(
     {

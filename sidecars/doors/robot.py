@@ -30,7 +30,6 @@ class Robot:
     def __init__(self, asked: Instructions, sidecar: PolicyClient) -> None:
         self.asked = asked
         self.turn, self.receiving = asyncio.Lock(), asyncio.Lock()
-        self.used_at = time.monotonic()
         self._sidecar = sidecar
         self._waiting: tuple[Observation, float] | None = None  # and when it came
         self._arrived = asyncio.Event()
