@@ -183,10 +183,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         config = effective_config(flags, file)
         # late: --help and --version need none of it
         from vram_arbiter.arbiter.daemon import Daemon
-        from vram_arbiter.arbiter.host.process import give_back_freed_memory, new_loop
+        from vram_arbiter.arbiter.host.process import new_loop
         from vram_arbiter.arbiter.log import set_up_logging, write_in_thread
         from vram_arbiter.arbiter.places import find_places
         from vram_arbiter.arbiter.reload import Source
+        from vram_arbiter.schemas.runtime.heap import give_back_freed_memory
 
         places = find_places(config, os.environ, os.getuid())
         if flags.check_config:

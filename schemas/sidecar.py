@@ -11,12 +11,12 @@ Endpoint family (policy)             {"endpoint": "ping" | "load" | "reset" | "g
                                      without "id": `get_action` → [the result, {}], an error →
                                      {"error": "Type: message"}, as the field's clients expect
 
-`detect`, `query` and `score` may carry "fresh_s": pictures that had to wait longer (for the GPU, a
-load, another request) are not looked at. Every request may carry "id" (echoed as "re": a DEALER may
-have several under way; REQ clients leave it out), "token" ([epoch, serial]: refuse with `evicted`
-unless it is the sidecar's current one) and "traceparent". Images are PNG or JPEG bytes of RGB,
-and a video is a list of them. Arrays are `{"__ndarray_class__": true, "as_npy": bytes}` (numpy's
-.npy format, pickle never allowed).
+`detect`, `query`, `score` and `get_action` may carry "fresh_s": pictures that had to wait longer
+(for the GPU, a load, another request) are not looked at. Every request may carry "id" (echoed as
+"re": a DEALER may have several under way; REQ clients leave it out), "token" ([epoch, serial]:
+refuse with `evicted` unless it is the sidecar's current one) and "traceparent". Images are PNG or
+JPEG bytes of RGB, and a video is a list of them. Arrays are
+`{"__ndarray_class__": true, "as_npy": bytes}` (numpy's .npy format, pickle never allowed).
 
 `get_action` answers the actions that are to be played before it is asked again, or with
 "whole_chunk" all that the policy predicted; it may carry "rtc", what its chunk shall continue. A
@@ -24,7 +24,9 @@ policy with a history takes the last `n_obs_steps` control steps in one observat
 and vector with a leading dimension (or a list of pictures), oldest first, and before there were
 so many, the first of the episode repeated. The answer to `reset` says how many, and how many
 actions are played (`ResetResult`). One observation alone, as the field's clients send it, is
-accepted as the first one after a `reset`, and always where one action is played.
+accepted as the first one after a `reset`, and always where one action is played. With "afresh" a
+call depends on no other one, so that several robots share a policy: what the policy remembers is
+forgotten, a shorter history is filled with its first step, and the answer says `n_obs_steps`.
 
 `load` makes the model resident (acquiring the lease) and answers with the lease id and token, so
 that a caller can mark a use of its own on it at the arbiter: a goal that spans many `get_action`
@@ -193,12 +195,13 @@ class RealTimeChunking(BaseModel):
     execution_horizon: Annotated[int, Field(ge=1, le=LEFT_OVER_MAX)]
 
 
-class EndpointCall(_Call):
+class EndpointCall(_Look):
     endpoint: Literal["ping", "load", "reset", "get_action", "unload", "shutdown"]
     data: Message | None = None
     # of `get_action`; the field's clients have no such fields
     rtc: RealTimeChunking | None = None
     whole_chunk: bool = False
+    afresh: bool = False
     api_token: str | None = None  # of the field's wire; not used on ipc
 
 

@@ -37,6 +37,7 @@ from vram_arbiter.sidecars import environment
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.gpu_passthrough import need_gpu
 from vram_arbiter.sidecars.check import Wanted, check, need_packages, need_precision, report
+from vram_arbiter.sidecars.doors.open import PACKAGES, Door, door_of
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.parent import end_with
 from vram_arbiter.sidecars.replaced import replaced
@@ -112,6 +113,8 @@ def settings_from(flags: argparse.Namespace) -> Settings:
     manifest, weights = read_model(wanted.rskill, wanted.configs)
     entry, device, endpoint = wanted.footprint(manifest), wanted.device, _endpoint(flags)
     need_gpu(manifest, device)
+    if wanted.door is not None:
+        wanted.door.check(manifest)
     same = {name: getattr(flags, name) for name in _SETTINGS}
     return Settings(
         **same,
@@ -127,7 +130,19 @@ def settings_from(flags: argparse.Namespace) -> Settings:
         stands_for=entry.stands_for,
         throttle_bytes_per_s=entry.throttle,
         evictable=not flags.pinned,
+        door=wanted.door,
     )
+
+
+def _door(flags: argparse.Namespace) -> Door | None:
+    """Return the door that the flags ask for. Raises ConfigError."""
+    if flags.door is None:
+        if flags.listen or flags.offer or flags.door_keys:
+            raise ConfigError("--listen, --offer and --door-keys are for --door", hint="add --door")
+        return None
+    uid = os.getuid()
+    offered = tuple(program_endpoint(name, os.environ, uid) for name in flags.offer)
+    return door_of(flags.door, flags.listen, offered, flags.door_keys)
 
 
 def wanted_from(flags: argparse.Namespace, adapter_for: AdapterFor) -> Wanted:
@@ -157,6 +172,7 @@ def wanted_from(flags: argparse.Namespace, adapter_for: AdapterFor) -> Wanted:
         footprint=footprint,
         allow_noncommercial=flags.allow_noncommercial,
         adapter_for=adapter_for,
+        door=_door(flags),
     )
 
 
@@ -212,6 +228,22 @@ def parser() -> argparse.ArgumentParser:
         help="also serve the endpoint on 127.0.0.1:N, for clients that need a port and users who"
         " may open the socket's file",
     )
+    add(
+        "--door",
+        choices=sorted(PACKAGES),
+        help="also serve a policy to clients of another project: lerobot's robot_client, or "
+        "openpi_client",
+    )
+    add("--listen", metavar="127.0.0.1:PORT", help="port of --door")
+    add(
+        "--offer",
+        action="append",
+        default=[],
+        type=_name,
+        metavar="NAME",
+        help="another sidecar whose policy lerobot's robots may choose at --door; may be repeated",
+    )
+    add("--door-keys", type=Path, metavar="FILE", help="API keys of --door openpi, one a line")
     add("--arbiter", metavar="EP", help="default: the arbiter's usual endpoint")
     add("--no-arbiter", action="store_true", help="load at once and stay resident, without a lease")
     add("--configs", type=Path, metavar="DIR", help="folder of local:// weights")

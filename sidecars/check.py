@@ -24,6 +24,7 @@ from vram_arbiter.sidecars.adapters.choose import ONNX
 from vram_arbiter.sidecars.adapters.gpu_passthrough import need_gpu
 from vram_arbiter.sidecars.adapters.onnx_detector import providers
 from vram_arbiter.sidecars.device.capacity import capacities
+from vram_arbiter.sidecars.doors.open import Door
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.quantization import check_precision
 from vram_arbiter.sidecars.replaced import replaced
@@ -53,6 +54,7 @@ class Wanted:
     footprint: Callable[[RSkillManifest], FootprintEntry]
     allow_noncommercial: bool
     adapter_for: AdapterFor
+    door: Door | None = None
 
 
 def check(wanted: Wanted) -> list[Finding]:
@@ -77,6 +79,10 @@ def check(wanted: Wanted) -> list[Finding]:
     except VramError as error:
         family = _bad("family", error)
     findings.append(family)
+    if (door := wanted.door) is not None:
+        findings.append(
+            _checked("door", f"{door.protocol}, port {door.port}", door.check, manifest)
+        )
     if manifest.weights_uri is None:
         return findings  # nothing to load: no bytes
     packages = _checked("packages", "installed", need_packages, manifest)

@@ -17,9 +17,9 @@ from vram_arbiter.clients.net.server import RouterServer, path_of
 from vram_arbiter.schemas.errors import NoGpu, VramError
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime import procfs
-from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.base import ModelCall
 from vram_arbiter.sidecars.device.capacity import leased_gpu
+from vram_arbiter.sidecars.doors.open import opened
 from vram_arbiter.sidecars.model_main import AdapterFor
 from vram_arbiter.sidecars.port import on_port
 from vram_arbiter.sidecars.residency import Residency
@@ -79,6 +79,11 @@ class SidecarHost:
             )
             if settings.port is not None:
                 await stack.enter_async_context(on_port(settings.port, path_of(settings.endpoint)))
+            if settings.door is not None:
+                answer_s = settings.wait_timeout_s + settings.request_timeout_s
+                await stack.enter_async_context(
+                    opened(settings.door, settings.manifest, settings.endpoint, answer_s)
+                )
             self._processes.preload(self._adapter.modules)
             residency = self._residency = Residency(settings, self._processes, client)
             if client is not None:
@@ -180,8 +185,7 @@ class SidecarHost:
             return {
                 "ok": True
             }  # a model that is not resident has nothing to forget, and no reason to load
-        fresh_s = None if isinstance(call, EndpointCall) else call.fresh_s
-        answer: Message = (await residency.run(name, call.token, message, fresh_s=fresh_s))[
+        answer: Message = (await residency.run(name, call.token, message, fresh_s=call.fresh_s))[
             "answer"
         ]
         return answer

@@ -10,6 +10,7 @@ import contextlib
 import logging
 import os
 import pwd
+import socket
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -22,16 +23,18 @@ _log = logging.getLogger("sidecars")
 
 
 @contextlib.asynccontextmanager
-async def on_port(port: int, path: Path) -> AsyncIterator[None]:
+async def on_port(
+    port: int, path: Path, connections_max: int = CONNECTIONS_MAX
+) -> AsyncIterator[None]:
     """Pass connections to the port on to the unix socket `path` within the block, at most
-    `CONNECTIONS_MAX` at a time. Raises ConfigError for a port that cannot be had."""
+    `connections_max` at a time. Raises ConfigError for a port that cannot be had."""
     passing: set[asyncio.Task[None]] = set()
     looking = asyncio.Lock()  # one at a time: refused users must not cost the event loop its time
 
     async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         assert task is not None, "a stream's callback is a task"
-        if len(passing) >= CONNECTIONS_MAX:
+        if len(passing) >= connections_max:
             writer.close()
             return
         passing.add(task)
@@ -42,6 +45,8 @@ async def on_port(port: int, path: Path) -> AsyncIterator[None]:
                 await _pass_on(reader, writer, path)
         except OSError as error:
             _log.warning("a connection to port %d ended: %s", port, error)
+        except asyncio.CancelledError:
+            pass  # the port ends; asyncio's streams take a canceled callback for a defect
         finally:
             passing.discard(task)
             writer.close()
@@ -63,8 +68,20 @@ async def on_port(port: int, path: Path) -> AsyncIterator[None]:
 
 
 async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, path: Path) -> None:
-    """Copy both ways until either end hangs up."""
-    inner_reader, inner_writer = await asyncio.open_unix_connection(path)
+    """Copy both ways until either end hangs up.
+
+    The end at the socket is bound to a name of the kernel's choice, by which a server that serves
+    several clients tells them apart.
+    """
+    inner = socket.socket(socket.AF_UNIX)
+    try:
+        inner.bind("")
+        inner.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(inner, str(path))
+    except BaseException:
+        inner.close()
+        raise
+    inner_reader, inner_writer = await asyncio.open_unix_connection(sock=inner)
     copies = [
         asyncio.create_task(_copy(reader, inner_writer)),
         asyncio.create_task(_copy(inner_reader, writer)),

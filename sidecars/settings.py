@@ -27,6 +27,7 @@ from vram_arbiter.schemas.manifest.vocabulary import Dtype
 from vram_arbiter.schemas.units import ByteSize
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 from vram_arbiter.schemas.yamltext import read_yaml, validated
+from vram_arbiter.sidecars.doors.open import Door
 from vram_arbiter.sidecars.weights import Weights, resolve, with_processors
 
 NICE_VARIABLE = "VRAM_ARBITER_SIDECAR_NICE"
@@ -98,6 +99,7 @@ class Settings:
     idle_release_s: float | None = None  # None: resident until another request needs the room
     standby: bool = False  # once evicted, it returns when there is room
     port: int | None = None  # of 127.0.0.1, in front of the endpoint
+    door: Door | None = None
 
     @property
     def revision(self) -> str:

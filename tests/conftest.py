@@ -59,6 +59,7 @@ LONGEST = (
 
 IMPORTING = (
     "tests/sidecars/adapters/",
+    "tests/sidecars/doors/",
     "tests/sidecars/test_quantization.py",
     "tests/runner/recording/test_recorder.py",
     "tests/runner/robots/test_lerobot_robot.py",

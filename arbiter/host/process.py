@@ -6,7 +6,6 @@ descriptor itself waits to the microsecond. Must not know what the daemon does.
 """
 
 import asyncio
-import ctypes
 import os
 import resource
 import select
@@ -25,8 +24,6 @@ SWITCH_S = 0.0005
 twenty times per reading: with Python's own 5 ms a client that floods the loop makes every reading
 take a tenth of a second.
 """
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # <malloc.h>
-_THRESHOLD_BYTES = 128 * 1024
 
 
 class FineSelector(selectors.EpollSelector):
@@ -46,21 +43,6 @@ class FineSelector(selectors.EpollSelector):
 
 def new_loop() -> asyncio.AbstractEventLoop:
     return asyncio.SelectorEventLoop(FineSelector())
-
-
-def give_back_freed_memory() -> None:
-    """Let malloc return large buffers to the kernel when they are freed, for the rest of this
-    process.
-
-    glibc raises its threshold for mmap (mallopt(3), M_MMAP_THRESHOLD) with every large buffer that
-    is freed, up to 32 MiB, and keeps what lies below it: after one attack with incomplete messages
-    the daemon stayed at 136 MiB; with fixed thresholds it is back at 29. Without effect on another
-    C library.
-    """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is not None:
-        mallopt(_M_MMAP_THRESHOLD, _THRESHOLD_BYTES)
-        mallopt(_M_TRIM_THRESHOLD, _THRESHOLD_BYTES)
 
 
 def memory_bytes() -> int:

@@ -1,5 +1,5 @@
 """Arrays on the sidecar wire: `{"__ndarray_class__": true, "as_npy": <bytes of numpy's .npy
-format>}`, never pickle. Those of the package msgpack-numpy are read as well.
+format>}`, never pickle. Those of the packages msgpack-numpy and openpi-client are read as well.
 
 Of that format only arrays of numbers are taken, and nothing is allocated before the header agrees
 with the bytes behind it. numpy is imported inside the functions: the base install has none.
@@ -23,6 +23,7 @@ DTYPE_MAX_CHARS = 16
 PLAIN_KINDS = (None, "", b"")  # of msgpack-numpy's arrays; "O" is pickled, "V" has fields
 NUMBERS = "biuf"  # kinds of numpy's: truth values, integers, floats
 _ND = b"nd"
+_OPENPI, _OPENPI_SCALAR = b"__ndarray__", b"__npgeneric__"
 _KEYS = (_ND, b"type", b"kind", b"shape", b"data")
 _HINT = "send numpy.save output of an array of numbers"
 
@@ -64,6 +65,11 @@ def unpack(value: Any) -> Any:
                 if isinstance(named["nd"], bool) and "data" in named:
                     count()
                     return _msgpack_numpy(named)
+            if value.get(_OPENPI) is True:
+                count()
+                return _openpi(value)
+            if value.get(_OPENPI_SCALAR) is True:
+                return plain(value.get(b"data"))
             return {key: plain(item) for key, item in value.items()}
         if isinstance(value, list | tuple):
             return [plain(item) for item in value]
@@ -88,11 +94,18 @@ def _msgpack_numpy(value: Message) -> Any:
         dtype: Any = numpy.dtype(wanted)
     except (TypeError, ValueError, SyntaxError) as error:
         raise BadRequest(f"an array of type {wanted!r}: {error}", hint=_HINT) from None
-    flat = _flat(data, dtype, [] if scalar else shape)
-    return flat[0].item() if scalar else flat.reshape(shape).copy()
+    numbers = flat(data, dtype, [] if scalar else shape)
+    return numbers[0].item() if scalar else numbers.reshape(shape).copy()
 
 
-def _flat(data: bytes, dtype: Any, shape: Sequence[Any], offset: int = 0) -> Any:
+def _openpi(value: dict[Any, Any]) -> Any:
+    """An array of openpi-client: `{b"__ndarray__": True, b"dtype", b"shape", b"data"}`, which is
+    msgpack-numpy's without a kind."""
+    found = {name: value.get(name.encode()) for name in ("dtype", "shape", "data")}
+    return _msgpack_numpy({"nd": True, "type": found.pop("dtype"), **found})
+
+
+def flat(data: bytes, dtype: Any, shape: Sequence[Any], offset: int = 0) -> Any:
     """The numbers behind `offset`, in a row; nothing is copied. Raises BadRequest where type, shape
     and bytes disagree."""
     import numpy
@@ -125,5 +138,5 @@ def _array(payload: object) -> Any:
         shape, fortran, dtype = readers[version](stream, max_header_size=HEADER_MAX_BYTES)
     except Exception as error:  # noqa: BLE001  numpy evaluates the header, which fails in many ways
         raise BadRequest(f"not an array in .npy format: {error}", hint=_HINT) from None
-    flat = _flat(payload, dtype, shape, stream.tell())
-    return flat.reshape(shape, order="F" if fortran else "C").copy()
+    numbers = flat(payload, dtype, shape, stream.tell())
+    return numbers.reshape(shape, order="F" if fortran else "C").copy()

@@ -48,6 +48,8 @@ class PolicyClient(SidecarClient):
         options: JsonMap | None = None,
         rtc: RealTimeChunking | None = None,
         whole_chunk: bool = False,
+        afresh: bool = False,
+        fresh_s: float | None = None,
         token: Sequence[int] | None = None,
         timeout_s: float | None = None,
     ) -> Message:
@@ -55,8 +57,9 @@ class PolicyClient(SidecarClient):
         are played before it is asked again, or the `whole_chunk`.
 
         `rtc` says what they shall continue; a policy that cannot be guided refuses it (BadRequest).
-        Raises Evicted when the sidecar holds another lease than `token`'s, ModelError, OutOfMemory,
-        SidecarUnavailable.
+        `afresh`: whatever was asked before is forgotten, and `n_obs_steps` is among the names.
+        Raises Evicted when the sidecar holds another lease than `token`'s, FrameStale after
+        `fresh_s`, ModelError, OutOfMemory, SidecarUnavailable.
         """
         data = {
             "observation": npy.pack(dict(observation)),
@@ -65,7 +68,11 @@ class PolicyClient(SidecarClient):
         fields: Message = {"data": data} | ({"rtc": rtc.model_dump()} if rtc is not None else {})
         if whole_chunk:
             fields["whole_chunk"] = True
-        result = npy.unpack(await self.call("get_action", fields, token=token, timeout_s=timeout_s))
+        if afresh:
+            fields["afresh"] = True
+        result = npy.unpack(
+            await self.call("get_action", fields, token=token, timeout_s=timeout_s, fresh_s=fresh_s)
+        )
         if isinstance(result, list) and result:  # the field's servers answer [actions, info]
             result = result[0]
         if not isinstance(result, dict):

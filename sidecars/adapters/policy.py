@@ -92,7 +92,8 @@ class PolicyAdapter:
     control step. So a call brings all of it: the last `n_obs_steps` control steps in a leading
     dimension, oldest first. A lone observation is taken where lerobot's loop has no other: the
     first of an episode fills the history by repetition, and where T is 1 each call is a control
-    step. Any other call is refused: observations that lie T steps apart look T times as fast.
+    step. Any other call is refused: observations that lie T steps apart look T times as fast. A
+    call `afresh` is the first of an episode, with as much of its history as is known.
     lerobot's inference server cannot be followed here: it gives one observation to
     `predict_action_chunk`, on which these policies fail.
 
@@ -249,12 +250,29 @@ class PolicyAdapter:
         assert self._pace is not None
         seen, played = self._pace.observations, self._pace.actions
         if call.endpoint == "reset":
-            self._policy.reset()
-            self._begun = False
+            self._forget()
             return {"ok": True, "n_obs_steps": seen, "n_action_steps": played}
         assert self._observations is not None
-        actions = self._act(self._observations.read(observation_of(call)), call.rtc)
-        return {"action": actions if call.whole_chunk else actions[:played]}
+        steps, told = self._observations.read(observation_of(call)), {}
+        if call.afresh:
+            self._begin_afresh()
+            steps = [steps[0]] * (seen - len(steps)) + steps
+            told = {"n_obs_steps": seen}
+        actions = self._act(steps, call.rtc)
+        return {"action": actions if call.whole_chunk else actions[:played], **told}
+
+    def _forget(self) -> None:
+        self._policy.reset()
+        self._begun = False
+
+    def _begin_afresh(self) -> None:
+        """Raise BadRequest for a policy that needs the observation after each of its actions."""
+        if self._family.replays:
+            raise BadRequest(
+                f"a policy of type {self._config.type} has to see the step after each action",
+                hint="serve its robot with a runner: at a door of other projects it cannot be used",
+            )
+        self._forget()
 
     def _act(self, steps: list[Batch], rtc: RealTimeChunking | None) -> "NDArray[Any]":
         import torch

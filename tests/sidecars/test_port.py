@@ -29,7 +29,9 @@ async def echo(reader, writer):
     writer.close()
 
 
-def test_bytes_pass_both_ways_and_a_hang_up_too(tmp_path):
+def test_bytes_pass_both_ways_and_a_hang_up_too(tmp_path, caplog):
+    """Regression: at its end the port logged a traceback for each connection."""
+
     async def story():
         served = await asyncio.start_unix_server(echo, tmp_path / "s")
         port = free_port()
@@ -53,6 +55,7 @@ def test_bytes_pass_both_ways_and_a_hang_up_too(tmp_path):
         writer.close()
 
     asyncio.run(asyncio.wait_for(story(), 60))
+    assert [record for record in caplog.records if record.levelname == "ERROR"] == []
 
 
 def test_a_cancellation_at_any_moment_closes_the_inner_connection(tmp_path):

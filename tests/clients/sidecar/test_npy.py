@@ -176,3 +176,23 @@ def test_damaged_arrays_are_read_or_refused(at: int, inserted: bytes) -> None:
         return
     assert isinstance(found, numpy.ndarray)
     assert found.nbytes <= len(damaged)
+
+
+@pytest.mark.heavy
+def test_arrays_of_openpi_are_read() -> None:
+    import msgpack
+    import numpy
+    from openpi_client import msgpack_numpy
+
+    sent = {
+        "image": numpy.arange(24, dtype=numpy.uint8).reshape(2, 4, 3),
+        "state": [numpy.float32(1.5), numpy.arange(3.0)],
+        "prompt": "grab",
+    }
+    found = npy.unpack(msgpack.unpackb(msgpack_numpy.packb(sent)))
+    numpy.testing.assert_array_equal(found["image"], sent["image"])
+    assert (found["state"][0], found["state"][1].tolist()) == (1.5, [0.0, 1.0, 2.0])
+    for kind in ("|O", "|V8", "<c8"):
+        array = {b"__ndarray__": True, b"data": bytes(8), b"dtype": kind, b"shape": [1]}
+        with pytest.raises(BadRequest, match="not of numbers"):
+            npy.unpack({"state": array})

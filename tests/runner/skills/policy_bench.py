@@ -54,7 +54,9 @@ class Sidecar:
         self.observations: list[Any] = []
         self.guidance: list[Any] = []  # "rtc" of each request for actions
         self.whole: list[bool] = []  # whether each asked for the whole chunk
+        self.requests: list[Message] = []  # for actions
         self.begun: Message = {}  # what it says of an episode
+        self.answer: Message = {}  # what it says beside actions
         self.serial = 1
         self.action: Any = None
         self.error: VramError | None = None
@@ -109,12 +111,14 @@ class Sidecar:
                 "loaded": True,
             }
         elif endpoint == "get_action":
+            self.requests.append(message)
             self.observations.append(npy.unpack(message["data"]["observation"]))
             self.guidance.append(message.get("rtc"))
             self.whole.append(message.get("whole_chunk", False))
             number = len(self.observations) - 1
             action = np.array([[number, i] for i in range(3)], dtype=np.float32) / 100
             reply = {"action": npy.pack(self.action if self.action is not None else action)}
+            reply |= self.answer
         elif endpoint == "ping":
             await asyncio.sleep(self.late_s)
             reply = {

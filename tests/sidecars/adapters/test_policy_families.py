@@ -4,7 +4,9 @@ A tiny checkpoint of each family is saved by lerobot (`policies.py`). The refere
 own loop in lerobot: preprocess, `select_action`, postprocess, at every control step.
 """
 
+import asyncio
 import json
+import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +16,10 @@ import pytest
 
 from tests.sidecars.adapters import backbone_policies, policies
 from tests.sidecars.adapters.policies import DIM, FRONT, ONLY_CAMERA, SIDE_PX, STATE, TASK, WRIST
+from tests.support.waiting import play
+from vram_arbiter.clients.net.server import RouterServer
+from vram_arbiter.clients.sidecar import npy
+from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.schemas.errors import (
     BadRequest,
     ConfigError,
@@ -23,13 +29,17 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.manifest import ModelFamily, RSkillManifest, parse_manifest
 from vram_arbiter.schemas.manifest.vocabulary import PROCESSOR_FAMILIES
+from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.policy import PolicyAdapter
 from vram_arbiter.sidecars.adapters.policy_families import FAMILIES
+from vram_arbiter.sidecars.doors.lerobot_messages import instructions_of, observation_of
+from vram_arbiter.sidecars.doors.robot import Robot
 from vram_arbiter.sidecars.host_weights import HostWeights
 from vram_arbiter.sidecars.settings import read_model
 from vram_arbiter.sidecars.weights import Weights, read_config
+from vram_arbiter.sidecars.wires import parse
 
 pytestmark = [pytest.mark.heavy, pytest.mark.usefixtures("small_networks")]
 
@@ -297,6 +307,34 @@ def test_a_history_takes_every_control_step_or_refuses(
     np.testing.assert_array_equal(np.stack(alone), expected, "each of them is a control step")
 
 
+@pytest.mark.parametrize("name", ["diffusion", "tdmpc", "act ensembling"])
+def test_a_call_afresh_depends_on_no_other_one(
+    checkpoint: Callable[[str], Weights], name: str
+) -> None:
+    """Robots of other projects share a policy: the answer to one was smoothed with another's."""
+    import numpy as np
+    import torch
+
+    adapter = load_policy(name, checkpoint(name))
+    length, _ = begin(adapter)
+    steps = observations(6)
+
+    def afresh(observation: dict[str, Any]) -> Any:
+        torch.manual_seed(SEED)
+        data = {"observation": observation}
+        answer = adapter.run(EndpointCall(endpoint="get_action", data=data, afresh=True))
+        assert answer["n_obs_steps"] == length
+        return answer["action"]
+
+    torch.manual_seed(SEED)
+    first = ask(adapter, steps[0])
+    ask(adapter, history(steps, 3, length))
+    np.testing.assert_array_equal(afresh(steps[0]), first, "as the first of an episode")
+    with_history = afresh(history(steps, 4, length))
+    np.testing.assert_array_equal(afresh(history(steps, 4, length)), with_history)
+    assert length == 1 or (afresh(steps[4]) != with_history).any(), "what it saw before counts"
+
+
 def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]) -> None:
     """Its cache takes the observations after its own actions: one too few or too many, and all
     later actions would be others than lerobot's.
@@ -337,6 +375,10 @@ def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]
     policy._encode_frames = encode
     torch.manual_seed(SEED)
     np.testing.assert_array_equal(ask(adapter, steps[0]), expected[:4], "a new episode")
+    with pytest.raises(BadRequest, match="has to see the step after each action"):
+        adapter.run(
+            EndpointCall(endpoint="get_action", data={"observation": steps[0]}, afresh=True)
+        )
     adapter.load("meta")
     meta = [sum(p.nbytes for p in network.parameters()) for network in adapter.networks]
     assert meta == sizes
@@ -861,3 +903,70 @@ def test_a_pinned_revision_is_what_is_loaded(
     adapter = load_policy("pi05", Weights("field/pi05", "0f1e2d"))
     assert asked == [("field/pi05", "0f1e2d")]
     assert ask(adapter, observations(1)[0]).shape == (3, DIM)
+
+
+AT_DOORS = [
+    pytest.param(name, marks=() if name in BY_DAY else pytest.mark.nightly)
+    for name in NAMES
+    if name != "lingbot_va"
+]
+
+
+@pytest.mark.parametrize("name", AT_DOORS)
+def test_a_family_is_served_at_lerobots_door(
+    checkpoint: Callable[[str], Weights], name: str, short_folder: Path
+) -> None:
+    """As lerobot's robots write their observations, with the history that the policy sees. At
+    lerobot's own server, diffusion fails at the first observation."""
+    import numpy as np
+    import torch
+    from lerobot.async_inference.helpers import RemotePolicyConfig, TimedObservation
+
+    adapter = load_policy(name, checkpoint(name))
+    length, _ = begin(adapter)
+    steps, joints = observations(4), [f"joint_{number}.pos" for number in range(DIM)]
+    prefix = "observation.images."
+    cameras = [one for one in adapter._config.input_features if one in steps[0] and one != STATE]
+    features: dict[str, Any] = {STATE: {"dtype": "float32", "shape": (DIM,), "names": joints}}
+    renamed = {prefix + one.rpartition(".")[2]: one for one in cameras}
+    features |= {one: {"dtype": "image", "shape": (SIDE_PX, SIDE_PX, 3)} for one in renamed}
+    config = RemotePolicyConfig("act", "test/model", features, 50, rename_map=renamed)
+    asked = instructions_of(pickle.dumps(config))
+
+    def answered(call: EndpointCall) -> Any:
+        torch.manual_seed(SEED)
+        return adapter.run(call)
+
+    async def story() -> None:
+        async def handle(peer: Any, message: Message) -> None:
+            reply: Message = {"ok": True}
+            if message["endpoint"] == "get_action":
+                call = parse(message, adapter.ops)
+                assert isinstance(call, EndpointCall)
+                reply = npy.pack(answered(call))
+            await server.send(peer, reply | {"re": message["id"]})
+
+        endpoint = f"ipc://{short_folder}/s"
+        async with (
+            RouterServer(endpoint, lambda error: {"error": str(error)}) as server,
+            PolicyClient(endpoint) as client,
+        ):
+            serving = asyncio.create_task(server.serve(handle))
+            robot = Robot(asked, client)
+            for number, step in enumerate(steps):
+                state = dict(zip(joints, map(float, step[STATE]), strict=True))
+                pictures = {asked.cameras[one]: step[one] for one in cameras}
+                raw = {**state, **pictures, "task": TASK}
+                timed = TimedObservation(
+                    timestamp=0.0, timestep=number, observation=raw, must_go=True
+                )
+                robot.offer(observation_of(pickle.dumps(timed), asked))
+                _, rows = await robot.act()
+                data = {"observation": history(steps, number, length)}
+                whole = EndpointCall(
+                    endpoint="get_action", data=data, afresh=True, whole_chunk=True
+                )
+                np.testing.assert_array_equal(rows, answered(whole)["action"][:50])
+            serving.cancel()
+
+    play(story)
