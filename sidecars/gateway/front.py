@@ -46,9 +46,6 @@ UPSTREAM: Final = "/upstream/"
 RETRY_AFTER_S: Final = 5
 CONNECT_TRIES: Final = 10
 LABEL_MAX_CHARS: Final = 60
-FOLLOW_MAX: Final = 16
-"""Streams of logs at a time."""
-FOLLOW_LINES_MAX: Final = 1000
 STATUS: Final[Mapping[type[VramError], int]] = {
     KeyRefused: 401,
     NotPermitted: 403,
@@ -91,7 +88,6 @@ class Front:
             for model in (name, *server.config.models)
         }
         self._held_bytes = 0
-        self._followers = 0
         self._own: Mapping[str, Answer] = {
             "/v1/models": self._models,
             "/running": self._running,
@@ -107,8 +103,6 @@ class Front:
             asker = self._asker(request)
             if (own := self._own.get(request.path)) is not None:
                 return own(request, asker)
-            if request.path == "/logs/stream":
-                return await self._follow_logs(request, asker)
             return await self._serve(request, asker)
         except VramError as error:
             return failure(error)
@@ -326,33 +320,6 @@ class Front:
         """Return the servers that `?model=` names, or all. Raises UnknownModel."""
         model = request.query.get("model")
         return self._visible(asker) if model is None else [self._server_of(model, asker)]
-
-    async def _follow_logs(self, request: web.BaseRequest, asker: Asker) -> web.StreamResponse:
-        servers = self._chosen(request, asker)
-        if self._followers >= FOLLOW_MAX:
-            raise LimitExceeded(f"{FOLLOW_MAX} streams of logs are open", hint="close one")
-        lines: asyncio.Queue[str] = asyncio.Queue(FOLLOW_LINES_MAX)
-
-        def follower(name: str) -> Callable[[str], None]:
-            def add(line: str) -> None:
-                if not lines.full():  # a reader that is too slow misses some
-                    lines.put_nowait(f"{name}: {line}\n")
-
-            return add
-
-        added = [(server.log.followers, follower(server.name)) for server in servers]
-        for followers, add in added:
-            followers.add(add)
-        self._followers += 1
-        response = web.StreamResponse(headers={"Content-Type": "text/plain; charset=utf-8"})
-        try:
-            await response.prepare(request)
-            while True:
-                await response.write((await lines.get()).encode())
-        finally:
-            self._followers -= 1
-            for followers, add in added:
-                followers.discard(add)
 
 
 class KeepAlive:

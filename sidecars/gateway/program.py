@@ -29,17 +29,13 @@ VRAMCTL: Final = (sys.executable, "-m", "vram_arbiter.clients")
 
 
 class Log:
-    """The last lines that a server printed. `followers` are called with each new one."""
+    """The last lines that a server printed."""
 
     def __init__(self) -> None:
         self.lines: deque[str] = deque(maxlen=LINES_MAX)
-        self.followers: set[Callable[[str], None]] = set()
 
     def add(self, line: bytes) -> None:
-        text = printable_lines(line[:LINE_MAX_BYTES].decode(errors="replace").rstrip())
-        self.lines.append(text)
-        for follower in list(self.followers):
-            follower(text)
+        self.lines.append(printable_lines(line[:LINE_MAX_BYTES].decode(errors="replace").rstrip()))
 
     def tail(self) -> str:
         return "\n".join(list(self.lines)[-TAIL_LINES:])

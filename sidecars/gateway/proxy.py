@@ -30,6 +30,9 @@ from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
 CONNECT_S: Final = 10.0
+KEPT_S: Final = 1.0
+"""A connection is used again within this time alone: servers close idle ones after 5 s and more, and
+a request that meets that fails."""
 CHUNK_BYTES: Final = 1 << 16
 WS_MESSAGE_MAX_BYTES: Final = 64 << 20
 WS_QUIET_S: Final = 5.0
@@ -54,8 +57,7 @@ class Unreached(SidecarUnavailable):
 def new_session() -> ClientSession:
     """Return the session of all upstream connections: no limit, no waiting, nothing decoded."""
     return ClientSession(
-        # a kept connection may be closed by the server while a request is sent, which then fails
-        connector=TCPConnector(limit=0, force_close=True),
+        connector=TCPConnector(limit=0, keepalive_timeout=KEPT_S),
         timeout=ClientTimeout(total=None, sock_connect=CONNECT_S),
         auto_decompress=False,
         skip_auto_headers=("user-agent", "accept", "accept-encoding", "content-type"),
