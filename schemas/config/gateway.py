@@ -15,8 +15,7 @@ from vram_arbiter.schemas.yamltext import parse_yaml, validated, without_empty
 LISTEN: Final = "127.0.0.1:8000"
 PRIORITY: Final = 40
 """Of servers, as of `vramctl run`: below the 50 of a robot's models."""
-PARALLEL_MAX: Final = 128
-"""Half of `limits.uses_per_lease_max`, which is what one process may take."""
+PARALLEL_MAX: Final = 1024
 OnEvict = Literal["stop", "http", "vllm", "ollama", "llama.cpp", "comfyui", "cuda-checkpoint"]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 Model = Annotated[str, Field(min_length=1, max_length=256)]

@@ -45,7 +45,6 @@ OWNER: Final = "vram-gateway"
 UPSTREAM: Final = "/upstream/"
 RETRY_AFTER_S: Final = 5
 CONNECT_TRIES: Final = 10
-LABEL_MAX_CHARS: Final = 60
 STATUS: Final[Mapping[type[VramError], int]] = {
     KeyRefused: 401,
     NotPermitted: 403,
@@ -267,11 +266,11 @@ class Front:
         self, request: web.BaseRequest, server: Server, asker: Asker
     ) -> AsyncIterator[Turn]:
         """Record a turn of the request: span, wait, duration."""
-        now, label = asyncio.get_running_loop().time, f"{request.method} {request.path}"
+        now = asyncio.get_running_loop().time
         labels = {telemetry.ATTR_CONSUMER: server.name}
         came, traceparent = now(), request.headers.get("traceparent")
         with tracing.span(telemetry.SPAN_GATEWAY_REQUEST, traceparent, labels):
-            async with server.turn(asker, label[:LABEL_MAX_CHARS]) as turn:
+            async with server.turn(asker) as turn:
                 tracing.event(telemetry.EVENT_GRANTED)
                 granted = now()
                 meters.measure(telemetry.METRIC_GATEWAY_WAIT, granted - came, labels)

@@ -2,9 +2,11 @@
 
     away → queued → starting → ready → leaving → away
 
-A request that waits lets the program be started, or woken. Each request is a use of the program's
-lease, so the arbiter knows what is in flight: an eviction waits for it, and it ends by itself after
-`grace_s`. Evicted with no request waiting, the program stays away.
+A request that waits lets the program be started, or woken. The program's lease is in use from the
+first request in flight to the last, so the arbiter knows what is in flight: an eviction waits for
+it, and it is ended after `grace_s`. Evicted with no request waiting, the program stays away.
+
+Requests share a use: one each would cost the arbiter as much as the gateway itself takes.
 """
 
 import asyncio
@@ -38,6 +40,11 @@ type State = Literal["away", "queued", "starting", "ready", "leaving"]
 REFUSED_S: Final = 0.25
 """After a use or a connection was refused: the program reports its revoke or its end within this
 time, or the revoke was withdrawn."""
+LINGER_S: Final = 0.05
+"""A use outlives its last request for so long, unless the program is leaving: the next request is
+often there by then."""
+IN_FLIGHT: Final = "requests in flight"
+"""Label of the use, which a waiter reads in `why`."""
 BACKOFF_S, BACKOFF_MAX_S = 1.0, 60.0
 """Pause after a program died, doubled each time until a request has been served."""
 WHY_S: Final = 2.0
@@ -64,7 +71,7 @@ class Turn:
 
 
 class Server:
-    """`async with server.turn(asker, label) as turn: …` for each request."""
+    """`async with server.turn(asker) as turn: …` for each request."""
 
     def __init__(
         self, name: str, config: ServerConfig, client: AsyncClient, reserved: Mapping[str, int]
@@ -82,6 +89,8 @@ class Server:
         self._closed = False
         self._since = self._now()  # of its state
         self._refused_until = 0.0
+        self._use: AsyncForeignUse | None = None
+        self._marking = asyncio.Lock()
         self._failures, self._not_before = 0, 0.0
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._tasks: set[asyncio.Task[None]] = set()
@@ -120,7 +129,7 @@ class Server:
 
     # -- requests
     @asynccontextmanager
-    async def turn(self, asker: Asker, label: str) -> AsyncIterator[Turn]:
+    async def turn(self, asker: Asker) -> AsyncIterator[Turn]:
         """Wait until the server can take the request, and mark it in flight within the block.
 
         Raises: LimitExceeded, WaitTimeout, with `details.why`; SidecarUnavailable: it died; Evicted
@@ -133,9 +142,9 @@ class Server:
             error.details["why"] = await self.why()
             raise
         self._cancel("idle")
-        use: AsyncForeignUse | None = None
+        turn: Turn | None = None
         try:
-            program, use = await self._begun(request, label)
+            program = await self._begun(request)
             async with asyncio.timeout(None) as limit:
                 turn = Turn(program.url, limit)
                 self._current.add(turn)
@@ -145,7 +154,7 @@ class Server:
                 finally:
                     self._current.discard(turn)
         except TimeoutError as error:
-            if use is not None and limit.expired():
+            if turn is not None and limit.expired():
                 raise Evicted(turn.reason, hint="send the request again") from error
             raise
         except SidecarUnavailable as error:
@@ -154,21 +163,19 @@ class Server:
         finally:
             self._turns.leave(request, self._now())
             self._begins.pop(request, None)
-            if use is not None:
-                await use.end()
             self._advance()
 
-    async def _begun(self, request: Request, label: str) -> tuple[Program, AsyncForeignUse]:
-        """Wait for the request's turn, and begin its use."""
+    async def _begun(self, request: Request) -> Program:
+        """Wait for the request's turn, with the program in use."""
         try:
             async with asyncio.timeout(self.config.wait_s):
                 while True:
                     begins = self._begins[request] = asyncio.get_running_loop().create_future()
                     self._advance()
-                    program = await begins
+                    program: Program = await begins
                     try:
-                        use = await self._client.begin_use(program.lease_id, program.token, label)
-                        return program, use
+                        await self._mark(program)
+                        return program
                     except (LeaseRevoking, LeaseLost, StaleToken, UnknownLease):
                         self._turns.put_back(request, self._now())
                         self.refused()
@@ -178,6 +185,18 @@ class Server:
                 hint="try again later",
                 details={"why": await self.why()},
             ) from None
+
+    async def _mark(self, program: Program) -> None:
+        """Begin a use of the program's lease, unless there is one. Raises what refuses it."""
+        async with self._marking:
+            use = self._use
+            if use is None or use.token != program.token or use.lost is not None:
+                self._use = await self._client.begin_use(program.lease_id, program.token, IN_FLIGHT)
+
+    def _end_use(self) -> None:
+        if self._use is not None and not self.in_flight:
+            self._spawn(self._use.end())
+            self._use = None
 
     def refused(self) -> None:
         """Note that a use was refused, or a connection: its program is about to report why."""
@@ -204,6 +223,11 @@ class Server:
         program, now = self._program, self._now()
         if self._closed:
             return
+        if self._use is not None and not self.in_flight:
+            if program is None or program.leaves:
+                self._end_use()
+            else:
+                self._after("use", LINGER_S, self._end_use)
         if program is None:
             if self.waiting and not self._starting:
                 if now < self._not_before:
