@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import httpx
 import openai
@@ -17,6 +18,8 @@ from tests.support.leases import view_of
 from tests.support.process import ArbiterProcess
 from tests.support.waiting import until
 from vram_arbiter.clients.sync import Client
+from vram_arbiter.reasoner.llm.config import LlmConfig
+from vram_arbiter.reasoner.llm.http import JsonHttp
 from vram_arbiter.schemas.runtime import procfs
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
@@ -189,6 +192,7 @@ async def test_a_server_that_dies_says_why_and_is_started_again(
         assert await asyncio.to_thread(pid_of, started, "a") != pid
 
 
+@pytest.mark.nightly
 async def test_what_can_never_fit_is_said_in_the_arbiters_words(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:
@@ -209,6 +213,7 @@ async def test_a_killed_gateway_leaves_nothing_behind(
         await eventually(lambda: not arbiter.status().leases)
 
 
+@pytest.mark.nightly
 async def test_a_killed_server_is_started_again(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:
@@ -283,6 +288,31 @@ async def test_a_streaming_client_hears_while_it_waits(
             started.let("u", 0)
             assert [line async for line in lines][-2:] == ["data: [DONE]", ""]
         await stuck
+
+
+async def test_the_reasoners_planner_asks_again_where_it_was_told_to_wait(
+    gateway: Start, arbiter_daemon: ArbiterProcess
+) -> None:
+    started = gateway(
+        {"a": stand_in(arbiter_daemon, 5), "b": stand_in(arbiter_daemon, 5, wait_s=5.0)}
+    )
+    config = LlmConfig(f"{started.url}/v1", "b", KEY, timeout_s=PATIENCE_S)
+    pauses: list[float] = []
+
+    async def pause(seconds: float) -> None:
+        pauses.append(seconds)
+        started.let("u", 0)
+        await stuck
+
+    async with openai_client(started) as client:
+        stuck = asyncio.create_task(ask(client, "a", user="u"))
+        await eventually(lambda: started.running().get("a", {}).get("in_flight") == 1)
+        http = JsonHttp({"authorization": f"Bearer {KEY}"}, config, pause, lambda: None)
+        body: dict[str, Any] = {"model": "b", "messages": HELLO}
+        answer = await http.post(f"{config.base_url}/chat/completions", body)
+        await http.close()
+    assert answer["model"] == "b"
+    assert pauses[0] == 5.0  # Retry-After
 
 
 async def test_keys_limit_who_may_use_what(
