@@ -3,12 +3,14 @@
 import asyncio
 import contextlib
 import os
+import resource
 import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import aiohttp
 import httpx
 import openai
 import pytest
@@ -129,6 +131,32 @@ async def test_a_sleeping_server_wakes_for_a_request_and_not_before(
             await eventually(lambda: not started.running())  # `a` sleeps on beside an empty GPU
             assert await asyncio.to_thread(pid_of, started, "a") == pid
     assert started.running()["a"]["switches"] == 3
+
+
+@pytest.mark.nightly
+async def test_a_thousand_waiting_clients_are_all_served(
+    gateway: Start, arbiter_daemon: ArbiterProcess
+) -> None:
+    """Regression: with the usual soft limit of 1,024 files a server could not be started."""
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(1024, before[1]), before[1]))
+    try:
+        started = gateway({name: stand_in(arbiter_daemon, 5, queue_max=500) for name in "ab"})
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (before[1], before[1]))
+
+    async def user(session: aiohttp.ClientSession, model: str) -> int:
+        body = {"model": model, "messages": HELLO}
+        async with session.post(f"{started.url}/v1/chat/completions", json=body) as answer:
+            await answer.read()
+            return answer.status
+
+    try:
+        async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(limit=0)) as session:
+            answers = await asyncio.gather(*(user(session, name) for name in "ab" * 500))
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert set(answers) == {200}
 
 
 # -- ends
@@ -398,8 +426,6 @@ def rss_bytes(pid: int) -> int:
 async def test_a_websocket_passes_and_does_not_keep_its_server(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:
-    import aiohttp
-
     started = gateway({"a": stand_in(arbiter_daemon, 5), "b": stand_in(arbiter_daemon, 5)})
     async with (
         aiohttp.ClientSession() as session,
