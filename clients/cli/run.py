@@ -130,7 +130,7 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     parser.add_argument(
         "--listen",
         metavar="ADDRESS:PORT",
-        help="serve the program, a model server, by HTTP there: it is started by the first request, "
+        help="serve the program, a model server, by HTTP there: started by the first request, "
         "and its requests wait while it is away (vram-gateway with one server; {port} in COMMAND "
         "is the port it has to listen on, unless --url says one)",
     )

@@ -31,8 +31,8 @@ from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
 CONNECT_S: Final = 10.0
 KEPT_S: Final = 1.0
-"""A connection is used again within this time alone: servers close idle ones after 5 s and more, and
-a request that meets that fails."""
+"""A connection is used again within this time alone: servers close idle ones after 5 s and more,
+and a request that meets that fails."""
 CHUNK_BYTES: Final = 1 << 16
 WS_MESSAGE_MAX_BYTES: Final = 64 << 20
 WS_QUIET_S: Final = 5.0
@@ -179,10 +179,8 @@ async def tunnel(
         client = web.WebSocketResponse(protocols=chosen, autoping=False, max_msg_size=most)
         await client.prepare(request)
     bursts = _Bursts(turn)
-    tasks = [
-        asyncio.create_task(work)
-        for work in (bursts.run(), _pass_on(client, upstream, bursts), _pass_on(upstream, client, bursts))
-    ]  # fmt: skip
+    there, back = _pass_on(client, upstream, bursts), _pass_on(upstream, client, bursts)
+    tasks = [asyncio.create_task(work) for work in (bursts.run(), there, back)]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     finally:

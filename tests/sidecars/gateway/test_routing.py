@@ -83,7 +83,8 @@ def test_a_body_without_a_model_has_none(body: bytes) -> None:
 
 @pytest.mark.parametrize(
     "body",
-    [b'{"model": 7}', b'{"model": null}', b'{"model": ""}', b'{"model": "' + b"x" * 5000, b"[" * 600,
+    [b'{"model": 7}', b'{"model": null}', b'{"model": ""}', b'{"model": "' + b"x" * 5000,
+     b"[" * 600,
      b'{"model" "x"' + b" " * 2000],
 )  # fmt: skip
 def test_what_cannot_be_a_model_is_refused(body: bytes) -> None:
