@@ -19,6 +19,7 @@ _PACKAGES = {
     "viz": "rerun",
     "mcp": "mcp",
     "doors": "grpc google",
+    "gateway": "aiohttp",
     "observer": "starlette uvicorn prometheus_client opentelemetry",
 }
 EXTRA_OF: Mapping[str, str] = {
