@@ -146,8 +146,8 @@ class RosIntegration(ManifestBlock):
     result_trajectory_field: Annotated[str, Field(max_length=200)] | None = None
     default_goal_json: Annotated[str, Field(min_length=2, max_length=10_000)]
     definition: Annotated[str, Field(max_length=100_000)] = ""
-    """Text of a service's `.srv` file, where it is not of std_srvs; definitions of messages that ROS
-    2 lacks follow, each behind 80 `=` and `MSG: package/Type`."""
+    """Text of a service's `.srv` file, where it is not of std_srvs; definitions of messages that
+    ROS 2 lacks follow, each behind 80 `=` and `MSG: package/Type`."""
     ros_dependencies: tuple[str, ...] = ()
     goal_builder: Literal["joint", "pose", "look_at"] | None = None
 

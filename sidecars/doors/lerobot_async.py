@@ -1,9 +1,10 @@
 """lerobot's asynchronous inference at a unix socket: gRPC, for its `robot_client` as it is.
 
 Each connection is one robot, known by the name of its end (`sidecars.port`). gRPC gives the clients
-of one process one connection, and so one robot. Differences to lerobot's server: several robots at once; a policy is chosen from what is offered, never loaded
-from where a robot says; pickles are read as data (`pickles`); what fails is told. Statuses are
-such that gRPC's clients do not repeat the request behind the robot's back.
+of one process one connection, and so one robot. Differences to lerobot's server: several robots at
+once; a policy is chosen from what is offered, never loaded from where a robot says; pickles are
+read as data (`pickles`); what fails is told. Statuses are such that gRPC's clients do not repeat
+the request behind the robot's back.
 """
 
 import asyncio

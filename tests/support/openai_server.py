@@ -1,6 +1,7 @@
 """Stand-in for a server with OpenAI's API.
 
-`python -m tests.support.openai_server FOLDER BYTES PORT` holds bytes on the simulated GPU in FOLDER and serves until SIGTERM.
+`python -m tests.support.openai_server FOLDER BYTES PORT` holds bytes on the simulated GPU in FOLDER
+and serves until SIGTERM.
 
 It sleeps and wakes as vLLM does. A chat streams `max_tokens` words, one each time a file named as
 the `user` of the body with the word's number appears in FOLDER, or at once without a `user`.
