@@ -37,7 +37,7 @@ setup: ## environment with everything (.venv)
 setup-core: ## environment of the base install (.venv-core)
 	@bash .ci/setup core
 
-setup-worlds: ## LIBERO and MetaWorld, with an older MuJoCo (.venv-worlds)
+setup-worlds: ## LIBERO, with an older MuJoCo (.venv-worlds)
 	@bash .ci/setup worlds
 
 jetson: ## as root on a Jetson: system packages, Cyclone DDS, NVIDIA's torch: ARGS=--dry-run

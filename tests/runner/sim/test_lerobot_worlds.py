@@ -1,9 +1,9 @@
 """Worlds of the field, played by `lerobot-eval` under this runner and a lease, with a checkpoint
 that is trained here.
 
-Nightly: their pictures take seconds of a core. PushT and ALOHA are played in `.venv`; LIBERO, a
-scene of our own in LIBERO and MetaWorld need an older MuJoCo than the runner, and `make nightly`
-plays them in `.venv-worlds`.
+Nightly: their pictures take seconds of a core. PushT and ALOHA are played in `.venv`; LIBERO
+and a scene of our own in it need an older MuJoCo than the runner, and `make nightly` plays them in
+`.venv-worlds`.
 """
 
 import importlib.util
@@ -21,7 +21,7 @@ from vram_arbiter.runner.__main__ import main
 
 pytestmark = [pytest.mark.heavy, pytest.mark.nightly, pytest.mark.timeout(1800)]
 ROOT = Path(__file__).parents[3]
-STEPS = 24
+STEPS, CHUNK = 24, 4
 TRAINED_STEPS = 10
 
 
@@ -34,7 +34,6 @@ class World:
     picture: str
     options: Mapping[str, Any] = field(default_factory=dict)
     plugin: str = ""
-    chunk: int = 4  # actions of an answer
 
     def flags(self) -> list[str]:
         """Return the flags of `lerobot-eval` for this world."""
@@ -56,7 +55,6 @@ WORLDS: Mapping[str, World] = {
         SMALL | {"task": "own_scene", "init_states": False, "episode_length": 10},
         plugin="tests.runner.libero_scene",
     ),
-    "metaworld": World("metaworld", "metaworld", IMAGE, {"task": "reach-v3"}, chunk=12),
 }  # fmt: skip
 
 
@@ -121,7 +119,7 @@ def train(folder: Path, world: World, shown: dict[str, Any]) -> tuple[float, flo
         },
         output_features={"action": PolicyFeature(FeatureType.ACTION, tuple(actions.shape[1:]))},
         device="cpu", dim_model=32, n_heads=2, dim_feedforward=32, n_encoder_layers=1,
-        use_vae=False, dropout=0.0, chunk_size=world.chunk, n_action_steps=world.chunk,
+        use_vae=False, dropout=0.0, chunk_size=CHUNK, n_action_steps=CHUNK,
         pretrained_backbone_weights=None,
     )  # fmt: skip
     stats = {
@@ -132,10 +130,10 @@ def train(folder: Path, world: World, shown: dict[str, Any]) -> tuple[float, flo
     policy = ACTPolicy(config)
     before, after = make_pre_post_processors(config, dataset_stats=stats)
     optimizer = torch.optim.AdamW(policy.parameters(), lr=1e-3)
-    starts = range(0, STEPS - world.chunk, 5)
+    starts = range(0, STEPS - CHUNK, 5)
     batch = {key: value[list(starts)] for key, value in shown.items()}
-    batch["action"] = torch.stack([actions[at : at + world.chunk] for at in starts])
-    batch["action_is_pad"] = torch.zeros(len(starts), world.chunk, dtype=torch.bool)
+    batch["action"] = torch.stack([actions[at : at + CHUNK] for at in starts])
+    batch["action_is_pad"] = torch.zeros(len(starts), CHUNK, dtype=torch.bool)
     losses = []
     for _ in range(TRAINED_STEPS):
         loss, _ = policy.forward(before(batch))
