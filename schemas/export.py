@@ -24,6 +24,7 @@ ROOTS: dict[str, str] = {
     "rskill": "vram_arbiter.schemas.manifest:RSkillManifest",
     "arbiter": "vram_arbiter.schemas.config.arbiter:ArbiterConfig",
     "observer": "vram_arbiter.schemas.config.observer:ObserverConfig",
+    "gateway": "vram_arbiter.schemas.config.gateway:GatewayConfig",
     "robot": "vram_arbiter.schemas.config.robot:RobotEnvironment",
 }
 """Documents with a single root: name → `module:class`."""

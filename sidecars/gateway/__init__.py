@@ -1,0 +1,17 @@
+"""`vram-gateway`: model servers behind one address, each awake when a request needs it.
+
+`vram-gateway serve --config FILE` prints `http://ADDRESS:PORT` as its first line on stdout once it
+listens, and runs until SIGTERM. Its parts:
+
+- `routing`: body → model's name → server; pure.
+- `turns`: which waiting request is next; pure.
+- `keys`: who asks, and for what it may; pure.
+- `program`: one model server under one lease, as a child `vramctl run --report`.
+- `server`: the states of one server, and the requests that wait for it.
+- `proxy`: bytes both ways, HTTP and WebSocket.
+- `front`: llama-swap's endpoints, limits, errors.
+- `gateway`: all of it joined; `__main__`: the command line.
+
+It must not import the daemon: a lease is `vramctl run`'s, and each request is a use of it by its
+token.
+"""
