@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import aiohttp
 
-PATIENCE_S = 12.0
+PATIENCE_S = 60.0
 """How long the field's clients wait for an answer."""
 
 
