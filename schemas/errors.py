@@ -223,6 +223,15 @@ class CheckpointUnsupported(OperatorError, code="checkpoint_unsupported"):
     """Driver, architecture, package or privileges do not allow suspending a program."""
 
 
+# -- the gateway of model servers
+class UnknownModel(CallerError, code="unknown_model"):
+    """No server behind the gateway has a model of this name; `details.models` lists them."""
+
+
+class KeyRefused(CallerError, code="key_refused"):
+    """No API key was shown, or none that the gateway knows."""
+
+
 # -- runner and reasoner
 class RunnerUnreachable(TransientError, code="runner_unreachable"):
     """The runner does not answer: not running, or hanging."""

@@ -10,9 +10,14 @@ What happens on an eviction is `clients.foreign`'s; docs/how-to/foreign-programs
 
 import argparse
 import asyncio
+import json
+import os
 import shutil
+import sys
 from collections.abc import Sequence
-from typing import Final
+from pathlib import Path
+from typing import Final, NoReturn
+from urllib.parse import urlsplit
 
 from pydantic import ValidationError
 
@@ -21,6 +26,7 @@ from vram_arbiter.clients.cli import arguments
 from vram_arbiter.clients.cli.signals import Forwarding
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.actions import Action
+from vram_arbiter.clients.foreign.control import Control
 from vram_arbiter.clients.foreign.cuda_checkpoint import CheckpointAction, CudaDriver
 from vram_arbiter.clients.foreign.http import HttpAction, Request, checked_url
 from vram_arbiter.clients.foreign.program import adopt_orphans
@@ -29,7 +35,7 @@ from vram_arbiter.clients.foreign.say import say
 from vram_arbiter.clients.foreign.servers import SERVERS
 from vram_arbiter.clients.foreign.supervisor import Supervisor
 from vram_arbiter.schemas.codec import to_map
-from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
+from vram_arbiter.schemas.defaults import MIN_RESIDENCY_S, NAME_MAX_CHARS
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.wire.requests import Status
 from vram_arbiter.schemas.wire.views import GpuView
@@ -46,6 +52,8 @@ OPTIONS: Final = (
     "url", "restore_url", "allow_remote", "timeout", "park",
 )  # fmt: skip
 TIMEOUT_S: Final = 60.0
+GATEWAY: Final = ("vram_arbiter.sidecars.gateway", "serve", "--config", "-")
+"""Started as a program: clients import no sidecar."""
 NOT_FOUND, NOT_STARTED = 127, 126  # as shells have it
 
 DESCRIPTIONS = {
@@ -93,6 +101,39 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         help="time from SIGTERM to SIGKILL, or for requests in progress (default: as long as it "
         "takes)",
     )
+    parser.add_argument(
+        "--min-residency",
+        type=arguments.at_least(0.0),
+        default=MIN_RESIDENCY_S,
+        metavar="SECONDS",
+        help="after its load it stays for this long (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--health",
+        metavar="URL",
+        help="answers 200 once the program can serve; until then the lease is loading",
+    )
+    parser.add_argument(
+        "--start",
+        type=arguments.at_least(0.1),
+        metavar="SECONDS",
+        help="end the program where --health does not answer this long after its start (default: "
+        "never)",
+    )
+    parser.add_argument(
+        "--control",
+        type=arguments.count(3, 1 << 20),
+        metavar="FD",
+        help="socket on which a program that started this one follows the lease and says when the "
+        "program is wanted; it does not return by itself then, and ends with the other program",
+    )
+    parser.add_argument(
+        "--listen",
+        metavar="ADDRESS:PORT",
+        help="serve the program, a model server, by HTTP there: started by the first request, "
+        "and its requests wait while it is away (vram-gateway with one server; {port} in COMMAND "
+        "is the port it has to listen on, unless --url says one)",
+    )
     _add_eviction(parser)
     arguments.add_endpoint(parser)
     parser.add_argument(
@@ -137,6 +178,8 @@ def run(args: argparse.Namespace) -> int:
         args.parser.error("expected a program to run: vramctl run --vram 5GiB -- COMMAND")
     if args.pin and args.on_revoke == "term":
         args.parser.error("--pin and --on-revoke term cannot be combined")
+    if args.listen is not None:
+        _exec_gateway(args, command)
     on_revoke: OnRevoke = "pin" if args.pin else args.on_revoke
     if on_revoke == "pin" and args.on_evict != "end":
         args.parser.error(f"a pinned program is not evicted: leave out --on-evict {args.on_evict}")
@@ -155,6 +198,10 @@ def run(args: argparse.Namespace) -> int:
         restarts=args.on_evict == "stop",
         action=action,
         park_bytes=(args.vram if parks else 0) if args.park is None else args.park,
+        health="" if args.health is None else _url(args, "health"),
+        start_s=args.start,
+        min_residency_s=args.min_residency,
+        control=_control(args),
     )
     try:
         checked_spec(to_map(lease_spec(spec)))
@@ -163,6 +210,45 @@ def run(args: argparse.Namespace) -> int:
         option = "--gpu" if problem["loc"] == ("gpu",) else "--name"
         args.parser.error(f"{option}: {problem['msg']}, got {problem['input']!r}")
     return asyncio.run(run_leased(spec, args.endpoint))
+
+
+def _exec_gateway(args: argparse.Namespace, command: Sequence[str]) -> NoReturn:
+    """Become a gateway with this program as its only server. Exits with 2 for options that it has
+    no use for."""
+    for option in ("exclusive", "pin", "on_revoke", "control", "allow_remote"):
+        if getattr(args, option):
+            args.parser.error(f"--{option.replace('_', '-')} cannot be combined with --listen")
+    urls = {
+        name: urlsplit(_url(args, name)) if getattr(args, name) else None
+        for name in ("url", "restore_url", "health")
+    }
+    by_http = args.on_evict == "http"
+    given = {
+        "command": command,
+        "vram": args.vram,
+        "on_evict": "stop" if args.on_evict == "end" else args.on_evict,
+        "free_path": urls["url"].path if by_http and urls["url"] else None,
+        "restore_path": urls["restore_url"].path if urls["restore_url"] else None,
+        "health": urls["health"].path if urls["health"] else None,
+        "port": urls["url"].port if urls["url"] else None,
+        "park": args.park,
+        "action_timeout_s": args.timeout,
+        "start_s": args.start,
+        "gpu": args.gpu,
+        "priority": args.priority,
+        "min_residency_s": args.min_residency,
+        "wait_s": args.wait,
+        "grace_s": args.grace,
+    }
+    server = {key: value for key, value in given.items() if value is not None}
+    name = args.name or Path(command[0]).name
+    config = json.dumps({"listen": args.listen, "servers": {name: server}})
+    memory = os.memfd_create("gateway")
+    os.write(memory, config.encode())
+    os.lseek(memory, 0, os.SEEK_SET)
+    os.dup2(memory, 0)  # its configuration; the program has no input
+    endpoint = ["--endpoint", args.endpoint] if args.endpoint else []
+    os.execv(sys.executable, [sys.executable, "-m", *GATEWAY, *endpoint])
 
 
 def _action(args: argparse.Namespace) -> Action | None:
@@ -188,6 +274,16 @@ def _action(args: argparse.Namespace) -> Action | None:
     return HttpAction(Request(_url(args, "url")), restoring, timeout_s)
 
 
+def _control(args: argparse.Namespace) -> Control | None:
+    if args.control is None:
+        return None
+    try:
+        return Control(args.control)
+    except OSError as error:
+        parser: argparse.ArgumentParser = args.parser
+        parser.error(f"--control {args.control}: not an open socket: {error.strerror}")
+
+
 def _url(args: argparse.Namespace, option: str, default: str = "") -> str:
     try:
         return checked_url(getattr(args, option) or default, remote=args.allow_remote)
@@ -205,7 +301,7 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
         return NOT_FOUND
     if spec.action is not None:
         spec.action.check()
-    if spec.comes_back:
+    if spec.tends_orphans:
         adopt_orphans()
     async with AsyncClient(
         f"vramctl run {spec.consumer}"[:NAME_MAX_CHARS], endpoint=endpoint

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 from vram_arbiter.clients.foreign.actions import Action
-from vram_arbiter.schemas.defaults import NAME_MAX_CHARS, RESIDUE_BYTES
+from vram_arbiter.clients.foreign.control import Control
+from vram_arbiter.schemas.defaults import MIN_RESIDENCY_S, NAME_MAX_CHARS, RESIDUE_BYTES
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
@@ -29,7 +30,9 @@ class RunSpec:
     takes. `restarts`: the program is ended to make room, and started again. `action`: it is made
     to free instead, and keeps `park_bytes` of host RAM meanwhile. With neither, its end is the end.
     `limit_s`: the program is ended after this time, which is no failure. `record`: the program's
-    bytes are recorded, and what it prints goes to stderr.
+    bytes are recorded, and what it prints goes to stderr. `health`: URL that answers 200 once it
+    can serve, `start_s` after its start at the latest; until then it loads. `control`: another
+    program says when it is wanted: evicted, it does not return by itself.
     """
 
     command: list[str]
@@ -47,6 +50,10 @@ class RunSpec:
     environ: Mapping[str, str] = field(default_factory=dict)
     limit_s: float | None = None
     record: Recorder | None = None
+    health: str = ""
+    start_s: float | None = None
+    min_residency_s: float = MIN_RESIDENCY_S
+    control: Control | None = None
 
     @property
     def consumer(self) -> str:
@@ -56,6 +63,11 @@ class RunSpec:
     @property
     def comes_back(self) -> bool:
         return self.restarts or self.action is not None
+
+    @property
+    def tends_orphans(self) -> bool:
+        """Whether processes that outlive the program are ended: its successor needs their room."""
+        return self.comes_back or self.control is not None
 
 
 def lease_spec(spec: RunSpec) -> LeaseSpec:
@@ -73,6 +85,7 @@ def lease_spec(spec: RunSpec) -> LeaseSpec:
         ),
         priority=spec.priority,
         evictable=spec.on_revoke != "pin",
-        standby=spec.comes_back,
+        min_residency_s=spec.min_residency_s,
+        standby=spec.comes_back and spec.control is None,
         park_bytes=spec.park_bytes,
     )

@@ -12,6 +12,7 @@ import os
 import signal
 from collections.abc import Callable, Coroutine
 from functools import partial
+from http import HTTPStatus
 from typing import Final, Protocol
 
 import anyio
@@ -21,13 +22,15 @@ from vram_arbiter.clients import cuda
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients._protocol.records import Eviction
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.clients.foreign.actions import Action
+from vram_arbiter.clients.foreign.actions import Action, Deadline
+from vram_arbiter.clients.foreign.control import REST, WANT, Control
+from vram_arbiter.clients.foreign.http import Request, answer
 from vram_arbiter.clients.foreign.peak import Peak
 from vram_arbiter.clients.foreign.program import STDERR, ForeignProgram
 from vram_arbiter.clients.foreign.run_spec import RunSpec, lease_spec
 from vram_arbiter.clients.foreign.say import say
 from vram_arbiter.clients.lease import AsyncLease
-from vram_arbiter.schemas.errors import CalibrationFailed, VramError
+from vram_arbiter.schemas.errors import ActionFailed, CalibrationFailed, VramError
 from vram_arbiter.schemas.sizes import format_bytes
 from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.requests import Status
@@ -37,7 +40,9 @@ log = logging.getLogger(__name__)
 PATIENCE_S: Final = 1.0
 FIRST_LOOK_S, LOOK_S = 0.2, 1.0  # the arbiter reads the GPU once a second
 BUSY_POLL_S: Final = 0.5
+HEALTH_POLL_S, HEALTH_TIMEOUT_S = 0.1, 5.0
 SUSPENDED_GRACE_S: Final = 5.0
+ABANDONED_GRACE_S: Final = 5.0
 UNTIL_ENDED: Final = "until it ends"
 """Label of the use of a program that does not come back: a waiter reads in `why` what it is for."""
 NO_LEASE: Final = "its lease is over"
@@ -66,11 +71,14 @@ class Supervisor:
         self._leave = asyncio.Event()  # the program is to make room, and comes back
         self._away = False  # its action has freed its memory
         self._ending = False  # it is made to end for good
+        self._abandoned = False  # the program that controls it has ended
         self._reason = NO_LEASE  # said when the program is made to leave
         self._told: set[str] = set()  # waiters that were named to the user
 
     async def acquire(self) -> None:
         """Wait for the first lease. Raises the typed error of one that was not granted."""
+        if self._spec.control is not None:
+            self._spawn(self._obey(self._spec.control))
         self._lease = await self._acquire(self._spec.wait_timeout_s)
 
     async def start(self, signals: Forwards) -> None:
@@ -98,7 +106,7 @@ class Supervisor:
         await asyncio.gather(*self._tasks, return_exceptions=True)
         if self._program is not None:
             await self._program.end(self._grace_s)  # where it has not ended itself
-            if self._spec.comes_back:
+            if self._spec.tends_orphans:
                 await self._program.end_orphans()
         try:
             if self._spec.record is not None:
@@ -137,7 +145,7 @@ class Supervisor:
 
     @property
     def _grace_s(self) -> float | None:
-        given = self._spec.grace_s
+        given = ABANDONED_GRACE_S if self._abandoned else self._spec.grace_s
         return SUSPENDED_GRACE_S if given is None and self._suspended else given
 
     # -- the program
@@ -163,7 +171,7 @@ class Supervisor:
         say(f"{self._reason}; sending SIGTERM")
         if await program.end(self._spec.grace_s):
             say(f"it did not end within {self._spec.grace_s:g} s and was killed")
-        if program.stopping and (count := await program.end_orphans()):
+        if self._spec.tends_orphans and (count := await program.end_orphans()):
             say(f"ended {count} of its processes that outlived it")
 
     async def _expire(self, limit_s: float) -> None:
@@ -194,6 +202,7 @@ class Supervisor:
             "term": self._unload,
             "priority": self._unload if self._spec.comes_back else self._ended,
         }
+        self._tell("queued")
         acquiring = self._client.acquire(
             lease_spec(self._spec),
             wait_timeout_s,
@@ -202,7 +211,40 @@ class Supervisor:
             on_revoke=self._revoke_asked,
             on_lost=self._lost,
         )
-        return await _tell_why(self._client, asyncio.ensure_future(acquiring), self._spec.consumer)
+        lease = await _tell_why(self._client, asyncio.ensure_future(acquiring), self._spec.consumer)
+        self._tell("loading", lease)
+        return lease
+
+    def _tell(self, state: str, lease: AsyncLease | None = None) -> None:
+        if (control := self._spec.control) is None:
+            return
+        if lease is None:
+            control.tell(state, "", (), "", "")
+            return
+        reason = lease.evicted.reason if lease.evicted is not None else ""
+        control.tell(state, lease.lease_id, lease.token, lease.gpu, reason)
+
+    async def _obey(self, control: Control) -> None:
+        """Do what the program on the control socket says; end with it."""
+        async for order in control.orders():
+            if order == WANT:
+                control.wanted.set()
+            elif order == REST:
+                control.wanted.clear()
+                self._reason = "it is not wanted any more"
+                self._spawn(self._rest())
+        if self._lease is None:  # nothing was started
+            signal.raise_signal(signal.SIGTERM)
+        self._abandoned = True
+        self._finish(-signal.SIGTERM)
+
+    async def _rest(self) -> None:
+        """Leave the GPU until wanted."""
+        with contextlib.suppress(VramError):  # it leaves already
+            if self._spec.park_bytes:
+                await self.lease.park()
+            else:
+                await self.lease.give_up()
 
     async def _follow(self) -> None:
         """Hold the lease while the program is resident; get it back where it was evicted."""
@@ -231,16 +273,20 @@ class Supervisor:
                 await holding
             state = lease.state
             while state not in ("standby", "parked", "gone"):
+                self._tell(state, lease)
                 state = await lease.wait_change(state)
         finally:
             holding.cancel()
         if state == "gone":
             await lease.wait_gone()
+        self._tell(state, lease)
 
     async def _hold(self, lease: AsyncLease) -> None:
         """Count the program as one long use until it is to make room, unless any request may have
         that."""
         try:
+            if not await self._serves():
+                return
             await lease.ready()
             state = lease.state
             while self._spec.on_revoke != "term" and state == "held":
@@ -251,11 +297,33 @@ class Supervisor:
         except VramError as error:
             log.warning("%s: %s", lease.lease_id, error)
 
+    async def _serves(self) -> bool:
+        """Wait until the program answers, if it says where. Return whether it does; else it is
+        ended."""
+        healthy = not self._spec.health
+        try:
+            async with asyncio.timeout(self._spec.start_s):
+                while not healthy:
+                    await asyncio.sleep(HEALTH_POLL_S)
+                    healthy = await _in_thread(_healthy, self._spec.health)
+        except TimeoutError:
+            say(f"{self._spec.health} did not answer 200 within {self._spec.start_s:g} s")
+            self._finish(1)
+            return False
+        return True
+
     async def _regain(self) -> None:
         """Wait until the program may return: by itself from standby, else as a new waiter."""
         lease, evicted = self.lease, self.lease.evicted
-        if lease.state == "parked" and evicted is not None and evicted.cause == "operator":
-            await lease.reacquire()  # it would not return by itself
+        asked = evicted is not None and evicted.cause == "operator"
+        if (control := self._spec.control) is not None:
+            await control.wanted.wait()
+            control.wanted.clear()
+            asked = True
+        if lease.state == "parked" and asked:  # it would not return by itself
+            self._tell("queued")
+            await lease.reacquire()
+            self._tell("loading", lease)
             return
         if lease.state != "gone":
             with contextlib.suppress(VramError):  # lost meanwhile
@@ -345,7 +413,7 @@ class Supervisor:
                 status = await self._client.ask(Status())  # its first page has all queues' heads
                 self.peak.measure(status, self.lease.lease_id)
                 self._decide(status)
-            if self._program is not None and self._program.running and self._spec.comes_back:
+            if self._program is not None and self._program.running and self._spec.tends_orphans:
                 # not while its successor is started, whose status it could take
                 self._program.reap()
             pause_s = LOOK_S
@@ -381,6 +449,13 @@ class Supervisor:
                 f"{consumer} waits for its room (priority {priority}): it gets it when the program "
                 "ends"
             )
+
+
+def _healthy(url: str) -> bool:
+    try:
+        return answer(Request(url, "GET"), Deadline(HEALTH_TIMEOUT_S)).status == HTTPStatus.OK
+    except ActionFailed:
+        return False
 
 
 async def _in_thread[T](work: Callable[..., T], *arguments: object) -> T:

@@ -11,6 +11,7 @@ from vram_arbiter.clients.observer.__main__ import parser as observer_parser
 from vram_arbiter.reasoner.options import parser as reasoner_parser
 from vram_arbiter.runner.__main__ import parser as runner_parser
 from vram_arbiter.sidecars.__main__ import parser as sidecar_parser
+from vram_arbiter.sidecars.gateway.__main__ import parser as gateway_parser
 
 EVERYWHERE = ("-h", "--version")  # options of every command, which its table leaves out
 
@@ -32,6 +33,7 @@ def parsers() -> Mapping[str, argparse.ArgumentParser]:
         "vram-arbiter": arbiter_parser(),
         "vram-observer": observer_parser(),
         "vram-sidecar": sidecar_parser(),
+        "vram-gateway": gateway_parser(),
         "vram-runner": runner_parser(),
         "vram-reasoner": reasoner_parser(reasoner),
     }

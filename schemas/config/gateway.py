@@ -15,8 +15,7 @@ from vram_arbiter.schemas.yamltext import parse_yaml, validated, without_empty
 LISTEN: Final = "127.0.0.1:8000"
 PRIORITY: Final = 40
 """Of servers, as of `vramctl run`: below the 50 of a robot's models."""
-PARALLEL_MAX: Final = 128
-"""Half of `limits.uses_per_lease_max`, which is what one process may take."""
+PARALLEL_MAX: Final = 1024
 OnEvict = Literal["stop", "http", "vllm", "ollama", "llama.cpp", "comfyui", "cuda-checkpoint"]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 Model = Annotated[str, Field(min_length=1, max_length=256)]
@@ -103,7 +102,8 @@ class LimitsConfig(_Section):
     """What clients may take of the gateway itself."""
 
     body_max_bytes: Annotated[ByteSize, Field(ge=1024, le=1 << 34)] = 256 << 20
-    """Largest request. Of a JSON body the part up to its `model` is held in memory."""
+    """Largest body that is routed by its model, by its Content-Length, or as far as it is held in
+    memory: up to its `model`. What follows passes through."""
     held_max_bytes: Annotated[ByteSize, Field(ge=1 << 16, le=1 << 34)] = 512 << 20
     """Bytes of bodies that all waiting requests together hold in memory."""
     header_max_bytes: Annotated[ByteSize, Field(ge=1024, le=1 << 20)] = 16 << 10
@@ -112,7 +112,7 @@ class LimitsConfig(_Section):
     """Longest time for a body's bytes to arrive while the gateway looks for its model, and longest
     silence of a kept-alive connection."""
     connections_per_peer: Annotated[int, Field(ge=1, le=65_536)] = 2048
-    """Connections of one address, or of one user on loopback, at a time."""
+    """Connections of one address at a time."""
 
 
 class GatewayConfig(_Section):

@@ -18,6 +18,7 @@ _PACKAGES = {
     "ros2": "cyclonedds rosbags",
     "viz": "rerun",
     "mcp": "mcp",
+    "gateway": "aiohttp",
     "observer": "starlette uvicorn prometheus_client opentelemetry",
 }
 EXTRA_OF: Mapping[str, str] = {

@@ -12,6 +12,6 @@ listens, and runs until SIGTERM. Its parts:
 - `front`: llama-swap's endpoints, limits, errors.
 - `gateway`: all of it joined; `__main__`: the command line.
 
-It must not import the daemon: a lease is `vramctl run`'s, and each request is a use of it by its
+It must not import the daemon: a lease is `vramctl run`'s, which requests in flight use by its
 token.
 """

@@ -25,6 +25,7 @@ from docs.hooks.programs import parsers, subcommands
 from tests.packaging.test_pages import PAGES, TREE
 from tests.support.deployment import load_robot
 from vram_arbiter.schemas.config.arbiter import load_config
+from vram_arbiter.schemas.config.gateway import load_gateway, load_keys
 from vram_arbiter.schemas.config.observer import load_observer
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.manifest.load import parse_manifest
@@ -233,6 +234,8 @@ KINDS: Mapping[frozenset[str], Callable[[str], object]] = {
     frozenset({"http"}): lambda text: load_observer(text, "page"),
     frozenset({"gpu"}): lambda text: load_config(text, "page"),
     frozenset({"revoke"}): lambda text: load_config(text, "page"),
+    frozenset({"servers"}): lambda text: load_gateway(text, "page"),
+    frozenset({"keys"}): lambda text: load_keys(text, "page"),
     frozenset({"services"}): yaml.safe_load,  # compose
     frozenset({"scrape_configs"}): yaml.safe_load,  # Prometheus
 }

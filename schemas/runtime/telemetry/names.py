@@ -39,6 +39,8 @@ SPAN_SIDECAR_LOAD = "sidecar.load"
 SPAN_SIDECAR_UNLOAD = "sidecar.unload"
 SPAN_SIDECAR_REQUEST = "sidecar.request"
 
+SPAN_GATEWAY_REQUEST = "gateway.request"
+
 # -- events within a span
 EVENT_DEADLINE_MISSED = "vram.event.deadline_missed"
 EVENT_ESTOP = "vram.event.estop_requested"
@@ -48,6 +50,8 @@ EVENT_SENSOR_STALE = "vram.event.sensor_stale"
 EVENT_SAFETY_VIOLATION = "vram.event.safety_violation"
 EVENT_ACTION_WITHHELD = "vram.event.action_withheld"
 EVENT_ANSWER_REJECTED = "vram.event.answer_rejected"  # within reasoner.plan: asked again
+EVENT_GRANTED = "vram.event.granted"  # within gateway.request: its server can take it
+EVENT_FIRST_BYTE = "vram.event.first_byte"
 EVENT_PREFETCH_HIT = "vram.event.chunk_prefetch_hit"
 EVENT_PREFETCH_MISS = "vram.event.chunk_prefetch_miss"
 
@@ -105,6 +109,10 @@ METRIC_GPU_MEMORY = metric("vram_runner.gpu.memory.usage", "By", "GPU memory of 
 METRIC_TOOL_CALLS = metric("vram_reasoner.tool_calls", "{call}", "Tool calls of the reasoner")
 METRIC_SIDECAR_LOAD = metric("vram_sidecar.load.duration", "s", "One load onto the GPU", WAITS_S)
 METRIC_SIDECAR_REQUEST = metric("vram_sidecar.request.duration", "s", "One request", TICKS_S)
+METRIC_GATEWAY_WAIT = metric("vram_gateway.wait.duration", "s", "Wait for a server", WAITS_S)
+METRIC_GATEWAY_REQUEST = metric(
+    "gen_ai.server.request.duration", "s", "A request from its server's grant to its end", WAITS_S
+)
 METRIC_CPU_TIME = metric("process.cpu.time", "s", "CPU time of this process")
 METRIC_MEMORY = metric("process.memory.usage", "By", "RAM of this process")
 

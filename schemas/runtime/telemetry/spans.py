@@ -25,6 +25,7 @@ _W3C = TraceContextTextMapPropagator()
 _KINDS = {
     telemetry.SPAN_GOAL: SpanKind.SERVER,
     telemetry.SPAN_SIDECAR_REQUEST: SpanKind.SERVER,
+    telemetry.SPAN_GATEWAY_REQUEST: SpanKind.SERVER,
     telemetry.SPAN_CHUNK: SpanKind.CLIENT,
     telemetry.SPAN_TOOL: SpanKind.CLIENT,
 }

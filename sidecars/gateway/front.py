@@ -1,0 +1,399 @@
+"""What clients see: endpoints, who may use what, limits, and errors as OpenAI's clients read them.
+
+Paths of llama-swap answer as there; `/upstream/NAME/…` goes to that server as it stands; any other
+path goes to the server of the body's `model`, or to the only server.
+"""
+
+import asyncio
+import json
+import logging
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from typing import Final
+from urllib.parse import unquote
+
+from aiohttp import ClientSession, web
+
+from vram_arbiter.clients.observer.page.access import Access
+from vram_arbiter.schemas.config.gateway import GatewayConfig
+from vram_arbiter.schemas.errors import (
+    ArbiterUnreachable,
+    BadRequest,
+    Evicted,
+    KeyRefused,
+    LimitExceeded,
+    MessageTooLarge,
+    NotPermitted,
+    SidecarUnavailable,
+    UnknownModel,
+    VramError,
+    WaitTimeout,
+)
+from vram_arbiter.schemas.runtime.telemetry import meters
+from vram_arbiter.schemas.runtime.telemetry import names as telemetry
+from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.schemas.urls import HttpAddress
+from vram_arbiter.sidecars.gateway import proxy
+from vram_arbiter.sidecars.gateway.keys import Asker, Keys
+from vram_arbiter.sidecars.gateway.routing import finder_of, no_model
+from vram_arbiter.sidecars.gateway.server import Server, Turn
+
+log = logging.getLogger(__name__)
+
+OWNER: Final = "vram-gateway"
+UPSTREAM: Final = "/upstream/"
+RETRY_AFTER_S: Final = 5
+CONNECT_TRIES: Final = 10
+STATUS: Final[Mapping[type[VramError], int]] = {
+    KeyRefused: 401,
+    NotPermitted: 403,
+    UnknownModel: 404,
+    MessageTooLarge: 413,
+    BadRequest: 400,
+    LimitExceeded: 503,
+    WaitTimeout: 503,
+    Evicted: 503,
+    ArbiterUnreachable: 503,
+    SidecarUnavailable: 502,
+}
+RETRIED: Final = 503
+"""Sent with Retry-After."""
+SHOWN_AS: Final = {"away": "stopped", "queued": "starting", "leaving": "stopping"}
+"""llama-swap's word of a state, where it has another one."""
+
+type Answer = Callable[[web.BaseRequest, Asker], web.StreamResponse]
+
+
+class Front:
+    """`handle` answers one request. `servers` by name; `upstream_keys`: keys that servers ask
+    for."""
+
+    def __init__(
+        self,
+        config: GatewayConfig,
+        address: HttpAddress,
+        servers: Mapping[str, Server],
+        keys: Keys,
+        session: ClientSession,
+        upstream_keys: Mapping[str, str],
+    ) -> None:
+        self._config, self._servers, self._keys = config, servers, keys
+        self._session, self._upstream_keys = session, upstream_keys
+        self._access = None if keys else Access(address, (), None)
+        self._by_model = {
+            model: server
+            for name, server in servers.items()
+            for model in (name, *server.config.models)
+        }
+        self._held_bytes = 0
+        self._own: Mapping[str, Answer] = {
+            "/v1/models": self._models,
+            "/running": self._running,
+            "/unload": self._unload,
+            "/logs": self._logs,
+        }
+
+    async def handle(self, request: web.BaseRequest) -> web.StreamResponse:
+        """Answer one request. Canceled where its client leaves."""
+        try:
+            if request.path == "/health":
+                return web.Response(text="OK")
+            asker = self._asker(request)
+            if (own := self._own.get(request.path)) is not None:
+                return own(request, asker)
+            return await self._serve(request, asker)
+        except VramError as error:
+            return failure(error)
+
+    # -- who asks
+    def _asker(self, request: web.BaseRequest) -> Asker:
+        """Raises KeyRefused, NotPermitted."""
+        if self._access is not None:
+            headers = {
+                name.lower().encode(): value.encode(errors="replace")
+                for name, value in request.headers.items()
+            }
+            if (denied := self._access.check(headers)) is not None:
+                raise NotPermitted(
+                    f"this request is refused: {denied.text}",
+                    hint="without keys the gateway is for programs of this machine alone",
+                )
+        shown = request.headers.get("authorization", ""), request.headers.get("x-api-key", "")
+        return self._keys.asker(*shown)
+
+    def _server_of(self, model: str, asker: Asker) -> Server:
+        """Raises UnknownModel, also for a server that the key may not use."""
+        server = self._by_model.get(model)
+        if server is None or not asker.may_use(server.name):
+            models = self._models_of(asker)
+            raise UnknownModel(
+                f"unknown model {model!r}", hint="see /v1/models", details={"models": models}
+            )
+        return server
+
+    def _models_of(self, asker: Asker) -> list[str]:
+        return [model for model, server in self._by_model.items() if asker.may_use(server.name)]
+
+    def _visible(self, asker: Asker) -> list[Server]:
+        return [server for server in self._servers.values() if asker.may_use(server.name)]
+
+    # -- requests for a server
+    async def _serve(self, request: web.BaseRequest, asker: Asker) -> web.StreamResponse:
+        if request.path.startswith(UPSTREAM):
+            name, slash, rest = request.raw_path.removeprefix(UPSTREAM).partition("/")
+            server = self._server_of(unquote(name.partition("?")[0]), asker)
+            return await self._pass_on(request, asker, server, slash + rest or "/", b"")
+        if len(self._servers) == 1:
+            (server,) = self._visible(asker) or [self._server_of("", asker)]
+            return await self._pass_on(request, asker, server, request.raw_path, b"")
+        body = bytearray()
+        async with self._holding(request) as hold:
+            model, stream = await self._read_model(request, body, hold)
+            server = self._server_of(model, asker)
+            return await self._pass_on(
+                request, asker, server, request.raw_path, bytes(body), stream=stream
+            )
+
+    async def _read_model(
+        self, request: web.BaseRequest, body: bytearray, hold: Callable[[int], None]
+    ) -> tuple[str, bool]:
+        """Read the body into `body` until its model is known. Return it, and whether the answer is
+        a stream. Raises BadRequest, MessageTooLarge, LimitExceeded."""
+        if not request.body_exists:
+            raise UnknownModel(f"nothing is served at {request.path}", hint="see /v1/models")
+        if request.headers.get("content-encoding", "identity") != "identity":
+            raise BadRequest("a compressed body cannot be routed", hint="use /upstream/NAME/…")
+        kind = request.headers.get("content-type", "")
+        finder = finder_of(kind, streams=self._config.keep_alive_s is not None)
+        await _continue(request)
+        try:
+            async with asyncio.timeout(None) as limit:
+                done = False
+                while not done:
+                    now = asyncio.get_running_loop().time()
+                    limit.reschedule(now + self._config.limits.head_s)
+                    data = await request.content.readany()
+                    if not data:
+                        break
+                    hold(len(data))
+                    body += data
+                    done = finder.feed(data)
+        except TimeoutError:
+            raise BadRequest(
+                f"nothing of the body came for {self._config.limits.head_s:g} s"
+            ) from None
+        if finder.model is None:
+            raise no_model()
+        return finder.model, finder.stream
+
+    @asynccontextmanager
+    async def _holding(self, request: web.BaseRequest) -> AsyncIterator[Callable[[int], None]]:
+        """Count the bytes of a body that are held in memory. Raises MessageTooLarge,
+        LimitExceeded."""
+        limits, held = self._config.limits, 0
+
+        def hold(count: int) -> None:
+            nonlocal held
+            if held + count > limits.body_max_bytes:
+                raise MessageTooLarge(f"a body is at most {limits.body_max_bytes} bytes")
+            if self._held_bytes + count > limits.held_max_bytes:
+                raise LimitExceeded(
+                    f"bodies of {limits.held_max_bytes} bytes are held already",
+                    hint="try again later",
+                    details={"limit": "held_max_bytes"},
+                )
+            held += count
+            self._held_bytes += count
+
+        if (request.content_length or 0) > limits.body_max_bytes:
+            raise MessageTooLarge(f"a body is at most {limits.body_max_bytes} bytes")
+        try:
+            yield hold
+        finally:
+            self._held_bytes -= held
+
+    async def _pass_on(
+        self,
+        request: web.BaseRequest,
+        asker: Asker,
+        server: Server,
+        target: str,
+        begun: bytes,
+        *,
+        stream: bool = False,
+    ) -> web.StreamResponse:
+        """Wait for the server, and let it answer."""
+        headers = proxy.upstream_headers(
+            request,
+            checked=bool(self._keys),
+            upstream_key=self._upstream_keys.get(server.name),
+        )
+        if request.headers.get("upgrade", "").lower() == "websocket":
+            return await proxy.tunnel(
+                self._session, request, target, headers, lambda: self._turn(request, server, asker)
+            )
+        early = KeepAlive(request, self._config.keep_alive_s if stream else None)
+        try:
+            tries = CONNECT_TRIES
+            while True:
+                try:
+                    async with early.while_waiting(), self._turn(request, server, asker) as turn:
+                        await early.stop()
+                        await _continue(request)
+                        return await proxy.forward(
+                            self._session,
+                            request,
+                            turn.url + target,
+                            headers,
+                            begun,
+                            early.response,
+                        )
+                except proxy.Unreached:
+                    tries -= 1
+                    if not tries:
+                        raise
+                    server.refused()
+        except VramError as error:
+            if early.response is not None:
+                return await early.fail(error)
+            if request.writer.output_size:  # a part of the answer is sent: it cannot be taken back
+                raise ConnectionAbortedError(str(error)) from error
+            raise
+
+    @asynccontextmanager
+    async def _turn(
+        self, request: web.BaseRequest, server: Server, asker: Asker
+    ) -> AsyncIterator[Turn]:
+        """Record a turn of the request: span, wait, duration."""
+        now = asyncio.get_running_loop().time
+        labels = {telemetry.ATTR_CONSUMER: server.name}
+        came, traceparent = now(), request.headers.get("traceparent")
+        with tracing.span(telemetry.SPAN_GATEWAY_REQUEST, traceparent, labels):
+            async with server.turn(asker) as turn:
+                tracing.event(telemetry.EVENT_GRANTED)
+                granted = now()
+                meters.measure(telemetry.METRIC_GATEWAY_WAIT, granted - came, labels)
+                yield turn
+            meters.measure(telemetry.METRIC_GATEWAY_REQUEST, now() - granted, labels)
+
+    # -- the gateway's own answers
+    def _models(self, request: web.BaseRequest, asker: Asker) -> web.Response:
+        created = int(time.time())
+        models = [
+            {"id": model, "object": "model", "created": created, "owned_by": OWNER}
+            for model in self._models_of(asker)
+        ]
+        return web.json_response({"object": "list", "data": models})
+
+    def _running(self, request: web.BaseRequest, asker: Asker) -> web.Response:
+        running = [
+            {
+                "model": server.name,
+                "state": SHOWN_AS.get(server.state, server.state),
+                "lease": server.state,
+                "gpu": server.gpu,
+                "in_flight": server.in_flight,
+                "waiting": server.waiting,
+                "switches": server.switches,
+            }
+            for server in self._visible(asker)
+            if server.state != "away" or server.waiting
+        ]
+        return web.json_response({"running": running})
+
+    def _unload(self, request: web.BaseRequest, asker: Asker) -> web.Response:
+        for server in self._chosen(request, asker):
+            server.unload()
+        return web.Response(text="OK")
+
+    def _logs(self, request: web.BaseRequest, asker: Asker) -> web.Response:
+        lines = [
+            f"{server.name}: {line}\n"
+            for server in self._chosen(request, asker)
+            for line in server.log.lines
+        ]
+        return web.Response(text="".join(lines))
+
+    def _chosen(self, request: web.BaseRequest, asker: Asker) -> list[Server]:
+        """Return the servers that `?model=` names, or all. Raises UnknownModel."""
+        model = request.query.get("model")
+        return self._visible(asker) if model is None else [self._server_of(model, asker)]
+
+
+class KeepAlive:
+    """Comments of an event stream (`: waiting`) while a request waits. `response`: None until one
+    was sent."""
+
+    def __init__(self, request: web.BaseRequest, every_s: float | None) -> None:
+        self._request, self._every_s = request, every_s
+        self._task: asyncio.Task[None] | None = None
+        self.response: web.StreamResponse | None = None
+
+    @asynccontextmanager
+    async def while_waiting(self) -> AsyncIterator[None]:
+        """Send comments until `stop`."""
+        if self._every_s is not None:
+            self._task = asyncio.create_task(self._send(self._every_s))
+        try:
+            yield
+        finally:
+            await self.stop()
+
+    async def stop(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+            self._task = None
+
+    async def fail(self, error: VramError) -> web.StreamResponse:
+        """End the stream with an event that says why."""
+        assert self.response is not None
+        event = f"event: error\ndata: {json.dumps(_body(error))}\n\n"
+        await self.response.write(event.encode())
+        await self.response.write_eof()
+        return self.response
+
+    async def _send(self, every_s: float) -> None:
+        while True:
+            await asyncio.sleep(every_s)
+            if self.response is None:
+                headers = {"Content-Type": "text/event-stream", "Cache-Control": "no-cache"}
+                self.response = web.StreamResponse(headers=headers)
+                await self.response.prepare(self._request)
+            await self.response.write(b": waiting\n\n")
+
+
+def failure(error: VramError) -> web.Response:
+    """Return the answer that says an error."""
+    status = next((code for kind, code in STATUS.items() if isinstance(error, kind)), 500)
+    headers = {}
+    if status == RETRIED:
+        headers["Retry-After"] = str(RETRY_AFTER_S)
+    elif status == 401:
+        headers["WWW-Authenticate"] = "Bearer"
+    response = web.json_response(_body(error), status=status, headers=headers)
+    if status in (401, 413):  # of a body nothing more is read
+        response.force_close()
+    return response
+
+
+def _body(error: VramError) -> dict[str, object]:
+    """Return an error as OpenAI's clients read it; Anthropic's read `type` as well."""
+    said = {
+        "message": str(error),
+        "type": error.code,
+        "code": error.code,
+        "param": None,
+        **error.details,
+    }
+    return {"type": "error", "error": said}
+
+
+async def _continue(request: web.BaseRequest) -> None:
+    """Let a client send its body that waits for permission (RFC 9110, 10.1.1), once."""
+    waits = request.headers.get("expect", "").lower() == "100-continue"
+    if waits and not request.content.is_eof() and not request.get("continued"):
+        request["continued"] = True
+        await request.writer.write(b"HTTP/1.1 100 Continue\r\n\r\n")
+        request.writer.output_size = 0

@@ -1,0 +1,102 @@
+"""A gateway as a process before stand-in servers, beside a real daemon with a simulated GPU."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import yaml
+
+from tests.support.process import ArbiterProcess
+from vram_arbiter.schemas.yamltext import TEXT_MAX_BYTES
+
+PATIENCE_S = 60.0
+KEY = "none-is-checked"
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    """The gateway is aiohttp's, and its clients here are asyncio's."""
+    return "asyncio"
+
+
+class GatewayProcess:
+    """`vram-gateway serve`. `url`: what it printed."""
+
+    def __init__(self, arbiter: ArbiterProcess, config: dict[str, Any], folder: Path) -> None:
+        self.folder = arbiter.gpu_folder
+        path = folder / "gateway.yaml"
+        text = yaml.safe_dump(config)
+        assert len(text) < TEXT_MAX_BYTES
+        path.write_text(text)
+        path.chmod(0o600)
+        self.errors = (folder / "gateway.log").open("wb")
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "vram_arbiter.sidecars.gateway", "serve", "--config", str(path)],
+            env={**os.environ, **arbiter.environ},
+            stdout=subprocess.PIPE,
+            stderr=self.errors,
+        )
+        assert self.process.stdout is not None
+        self.url = self.process.stdout.readline().decode().strip()
+        assert self.url, (folder / "gateway.log").read_text()
+
+    def running(self) -> dict[str, dict[str, Any]]:
+        """What `/running` says, by server."""
+        found = httpx.get(f"{self.url}/running", timeout=PATIENCE_S).json()["running"]
+        return {one["model"]: one for one in found}
+
+    def logs(self) -> str:
+        return httpx.get(f"{self.url}/logs", timeout=PATIENCE_S).text
+
+    def let(self, user: str, *numbers: int) -> None:
+        """Let a stand-in go on with these words of a chat."""
+        for number in numbers:
+            (self.folder / f"{user}.{number}").touch()
+
+    def close(self) -> None:
+        self.process.send_signal(signal.SIGTERM)
+        try:
+            self.process.wait(PATIENCE_S)
+        finally:
+            self.process.kill()
+            self.process.wait(PATIENCE_S)
+            assert self.process.stdout is not None
+            self.process.stdout.close()
+            self.errors.close()
+
+
+def stand_in(arbiter: ArbiterProcess, gib: float, **fields: Any) -> dict[str, Any]:
+    """The configuration of a stand-in server."""
+    size = str(int(gib * (1 << 30)))
+    command = [sys.executable, "-m", "tests.support.openai_server", str(arbiter.gpu_folder), size]
+    return {
+        "command": [*command, "{port}"],
+        "vram": f"{gib}GiB",
+        "min_residency_s": 0.0,
+        "grace_s": PATIENCE_S,
+        "wait_s": PATIENCE_S,
+        **fields,
+    }
+
+
+@pytest.fixture
+def gateway(
+    arbiter_daemon: ArbiterProcess, tmp_path: Path
+) -> Iterator[Callable[..., GatewayProcess]]:
+    """`gateway({"a": stand_in(…)}, keys_file=…)` starts one."""
+    made: list[GatewayProcess] = []
+
+    def start(servers: dict[str, Any], **fields: Any) -> GatewayProcess:
+        config = {"listen": "127.0.0.1:0", "servers": servers, **fields}
+        made.append(GatewayProcess(arbiter_daemon, config, tmp_path))
+        return made[-1]
+
+    yield start
+    for one in made:
+        one.close()
