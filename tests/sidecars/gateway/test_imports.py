@@ -58,7 +58,7 @@ def test_commands_names_and_limits() -> None:
     )
     assert qwen.models == ("Qwen/Qwen3:4b", "gpt-4o-mini", "qwen")
     assert qwen.env == {"CUDA_VISIBLE_DEVICES": "0", "URL": "http://127.0.0.1:{port}/a=b"}
-    assert (qwen.health, qwen.parallel, qwen.idle_s) == ("/ready", 128, None)
+    assert (qwen.health, qwen.parallel, qwen.idle_s) == ("/ready", 500, None)
     assert (fixed.port, fixed.idle_s, fixed.start_s) == (9100, 300, 90)
     assert fixed.command[-1] == "4096"
     assert fixed.vram == qwen.vram == 4 << 30
