@@ -3,6 +3,7 @@ here are ever signalled."""
 
 import asyncio
 import os
+import re
 import signal
 import sys
 from collections.abc import Mapping
@@ -28,6 +29,11 @@ class Program:
         """The last lines that it printed, for error messages."""
         lines = self.log.read_text(errors="replace").splitlines()
         return "\n".join(lines[-LOG_TAIL_LINES:])
+
+    def said(self, pattern: str) -> str | None:
+        """Return the first group of `pattern` in what it has printed so far."""
+        found = re.search(pattern, self.log.read_text(errors="replace"), re.MULTILINE)
+        return None if found is None else found[1]
 
 
 @dataclass(slots=True)

@@ -7,11 +7,13 @@ import shutil
 import sys
 import tempfile
 import time
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Final
 
 from vram_arbiter.clients.cli.demo_display import Display
-from vram_arbiter.clients.cli.demo_programs import Program, Programs
+from vram_arbiter.clients.cli.demo_programs import Programs
 from vram_arbiter.clients.cli.timeline import chart, collect
 from vram_arbiter.clients.cli.timeline.collect import Range
 from vram_arbiter.clients.client import AsyncClient
@@ -31,32 +33,42 @@ def run() -> int:
 
 
 async def _demo() -> int:
-    runtime = Path(tempfile.mkdtemp(prefix="vram-demo-"))  # short, for the paths of its sockets
-    folder = runtime / "fakegpu"
-    endpoint = f"ipc://{runtime}/arbiter.sock"
-    environ = {
-        RUNTIME_VARIABLE: str(runtime),
-        ENDPOINT_VARIABLE: endpoint,  # not the machine's own arbiter
-        fakegpu.FOLDER_VARIABLE: str(folder),
-    }
-    programs = Programs(runtime, environ)
-    try:
-        print("starting the arbiter on a simulated GPU of 8 GiB, and three programs")
-        await programs.start("arbiter", "arbiter", "--gpu", "fake:8GiB")
-        async with AsyncClient("demo", endpoint=endpoint, connect_timeout_s=LIMIT_S) as client:
-            started = [
-                await programs.start(name, "clients.cli.demo_stand_in", name, size)
-                for name, size in STAND_INS.items()
-            ]
-            events = await _follow(client, started)
+    print("starting the arbiter on a simulated GPU of 8 GiB, and three programs")
+    async with private_arbiter() as (programs, client):
+        started = [
+            await programs.start(name, "clients.cli.demo_stand_in", name, size)
+            for name, size in STAND_INS.items()
+        ]
+        events = await follow(
+            client, lambda: any(one.process.returncode is None for one in started)
+        )
         failed = [one for one in started if one.process.returncode != 0]
         for program in failed:
             print(f"{program.name} did not do its jobs:\n{program.tail()}", file=sys.stderr)
         kinds = {event["kind"] for event in events}
-        if "granted" in kinds:
-            first_s = min(event["at_wall_s"] for event in events if event["kind"] == "granted")
-            print("\n" + "\n".join(chart.lines(collect.from_history(Range(first_s), endpoint))))
+        draw(events, programs.environ[ENDPOINT_VARIABLE])
         return 0 if not failed and "oom" not in kinds and "verified" in kinds else 1
+
+
+@asynccontextmanager
+async def private_arbiter(*flags: str) -> AsyncIterator[tuple[Programs, AsyncClient]]:
+    """Start an arbiter of the demo's own on a simulated GPU of 8 GiB; programs that are started
+    beside it find it. All are ended at the end of the block.
+
+    Raises ArbiterUnreachable, SidecarUnavailable.
+    """
+    runtime = Path(tempfile.mkdtemp(prefix="vram-demo-"))  # short, for the paths of its sockets
+    endpoint = f"ipc://{runtime}/arbiter.sock"
+    environ = {
+        RUNTIME_VARIABLE: str(runtime),
+        ENDPOINT_VARIABLE: endpoint,  # not the machine's own arbiter
+        fakegpu.FOLDER_VARIABLE: str(runtime / "fakegpu"),
+    }
+    programs = Programs(runtime, environ)
+    try:
+        await programs.start("arbiter", "arbiter", "--gpu", "fake:8GiB", *flags)
+        async with AsyncClient("demo", endpoint=endpoint, connect_timeout_s=LIMIT_S) as client:
+            yield programs, client
     except ArbiterUnreachable:
         programs.check()  # says why it ended
         raise
@@ -65,14 +77,21 @@ async def _demo() -> int:
         shutil.rmtree(runtime, ignore_errors=True)
 
 
-async def _follow(client: AsyncClient, started: list[Program]) -> list[JsonMap]:
-    """Print what happens until all programs have ended. Returns the events."""
+async def follow(client: AsyncClient, unfinished: Callable[[], bool]) -> list[JsonMap]:
+    """Print what happens while there is something unfinished, LIMIT_S at most. Returns the
+    events."""
     events, began_s, going, display = list[JsonMap](), time.time(), True, Display()
     while going:
-        left_s = LIMIT_S - (time.time() - began_s)
-        going = left_s > 0 and any(one.process.returncode is None for one in started)
+        going = time.time() - began_s < LIMIT_S and unfinished()
         for event in (await client.history(after=events[-1]["seq"] if events else 0)).events:
             events.append(event)
             display.event(event, event["at_wall_s"] - began_s)
         await asyncio.sleep(0.1)
     return events
+
+
+def draw(events: Sequence[JsonMap], endpoint: str) -> None:
+    """Print the timeline from the first grant on, if there was one."""
+    if granted_s := [event["at_wall_s"] for event in events if event["kind"] == "granted"]:
+        drawn = chart.lines(collect.from_history(Range(min(granted_s)), endpoint))
+        print("\n" + "\n".join(drawn))

@@ -3,7 +3,7 @@
 import argparse
 import asyncio
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +16,7 @@ from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.telemetry.commands import command
 from vram_arbiter.schemas.runtime.version import add_version
 from vram_arbiter.schemas.yamltext import read_text
+from vram_arbiter.sidecars.gateway import imports
 
 PROGRAM: Final = "vram-gateway"
 EXIT_FAILED, EXIT_USAGE, EXIT_UNREACHABLE = 1, 2, 3
@@ -49,6 +50,10 @@ def parser() -> argparse.ArgumentParser:
     )
     serve.add_argument("--log-format", choices=logs.FORMS, default="human")
     arguments.add_endpoint(serve)
+    serve.set_defaults(run=_serve)
+    convert = commands.add_parser("import", help="convert a configuration of llama-swap")
+    imports.add_arguments(convert)
+    convert.set_defaults(run=imports.run)
     return made
 
 
@@ -87,7 +92,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Returns the exit code; prints errors of the operator as one line without a traceback."""
     args = parser().parse_args(argv)
     try:
-        return _serve(args)
+        run: Callable[[argparse.Namespace], int] = args.run
+        return run(args)
     except VramError as error:
         terminal.complain(PROGRAM, error)
         match error:
