@@ -118,6 +118,7 @@ ATTR_BYTES = "vram.bytes"  # spans only
 ATTR_SKILL = "rskill.id"
 ATTR_REVISION = "rskill.revision"
 ATTR_GOAL = "rskill.goal_id"  # spans only
+ATTR_CONFIDENCE = "action.confidence"  # spans only
 ATTR_TOOL = "reasoner.tool"
 ATTR_SENSOR = "vram.sensor"
 ATTR_OPERATION = "sidecar.operation"

@@ -57,6 +57,7 @@ class Sidecar:
         self.begun: Message = {}  # what it says of an episode
         self.serial = 1
         self.action: Any = None
+        self.confidence: list[Any] = []  # of the next chunks
         self.error: VramError | None = None
         self.load_error: VramError | None = None
         self.arbitrated = True
@@ -115,6 +116,8 @@ class Sidecar:
             number = len(self.observations) - 1
             action = np.array([[number, i] for i in range(3)], dtype=np.float32) / 100
             reply = {"action": npy.pack(self.action if self.action is not None else action)}
+            if self.confidence:
+                reply["confidence"] = npy.pack(self.confidence.pop(0))
         elif endpoint == "ping":
             await asyncio.sleep(self.late_s)
             reply = {
