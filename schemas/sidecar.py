@@ -19,8 +19,9 @@ JPEG bytes of RGB, and a video is a list of them. Arrays are
 `{"__ndarray_class__": true, "as_npy": bytes}` (numpy's .npy format, pickle never allowed).
 
 `get_action` answers the actions that are to be played before it is asked again, or with
-"whole_chunk" all that the policy predicted; it may carry "rtc", what its chunk shall continue. A
-policy with a history takes the last `n_obs_steps` control steps in one observation: each picture
+"whole_chunk" all that the policy predicted; it may carry "rtc", what its chunk shall continue. The
+answer may have "confidence", a number or several (0 to 1): the actions have their mean.
+A policy with a history takes the last `n_obs_steps` control steps in one observation: each picture
 and vector with a leading dimension (or a list of pictures), oldest first, and before there were
 so many, the first of the episode repeated. The answer to `reset` says how many, and how many
 actions are played (`ResetResult`). One observation alone, as the field's clients send it, is

@@ -256,6 +256,7 @@ class Deploy:
             lambda skill: parts.gate.for_skill(skill.manifest, skill.cameras),
             rate_hz=robot.rate_hz,
             deadline_policy=DeadlinePolicy(robot.deadline_overrun_policy),
+            latency_budget_ms=robot.latency_budget_ms,
             clock=self._clock,
             topics={s.sensor_id: s.publish_topic for s in robot.sensors if s.publish_topic},
             detections=slots_of(self._watches),

@@ -76,6 +76,8 @@ class _Tick:
 class ControlLoop[R: Robot]:
     """Ticks at `rate_hz`; 0 runs as fast as it can, without deadlines.
 
+    A tick that takes longer than `latency_budget_ms` (None: a period) is a budget violation.
+
     Everything runs on the control thread, except `request_stop`, `request_estop` and what the
     event loop may read at any time: `progress`, `world`, `caption` and `estop` are replaced whole.
     """
@@ -86,6 +88,7 @@ class ControlLoop[R: Robot]:
         *,
         rate_hz: float = 30.0,
         deadline_policy: DeadlinePolicy = DeadlinePolicy.WARN,
+        latency_budget_ms: float | None = None,
         clock: Clock | None = None,
         latch: EstopLatch | None = None,
         video: Video | None = None,
@@ -100,13 +103,14 @@ class ControlLoop[R: Robot]:
         self.spans = TickSpans()
         self.tick_idx = 0
         self.deadline_misses = 0  # ticks that ended after their slot
-        self.budget_violations = 0  # ticks that took longer than a period, whenever they began
+        self.budget_violations = 0  # ticks that took longer than allowed, whenever they began
         self.late_actions_withheld = 0
         self.caption: tuple[str, ...] = ()  # lines for the video
         self.identity: GoalData = {}  # what runs: robot, scene, seed; part of the result
         self.save_dir: str | None = None  # folder of the dataset that the run is recorded into
         self._video = video
         self._pacing = Pacing(rate_hz, self.clock)
+        self._budget_ms = latency_budget_ms or 1e3 * (self._pacing.period_s or math.inf)
         self._stopping = threading.Event()
         self._first_tick = 0  # of the present run
         self._obeyed = False  # the latched stop, at least once
@@ -326,7 +330,7 @@ class ControlLoop[R: Robot]:
         )
         meters.measure(telemetry.METRIC_TICK, result.tick_ms / 1e3, labels)
         self.slot.follower.tick_over(lambda goal: self._goal_tick(goal, tick, result))
-        if not math.isinf(tick.slot.deadline_s) and result.tick_ms > 1e3 / self.rate_hz:
+        if not math.isinf(tick.slot.deadline_s) and result.tick_ms > self._budget_ms:
             self.budget_violations += 1
             meters.count(telemetry.METRIC_BUDGET_VIOLATIONS, labels)
         if result.deadline_missed:

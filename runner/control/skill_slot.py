@@ -181,6 +181,7 @@ class SkillSlot:
         match outcome:
             case Act(action=action, chunk_index=chunk_index, chunk=chunk, problem=short):
                 active.acted = True
+                tracing.note({telemetry.ATTR_CONFIDENCE: action.confidence})
                 decision.chunk_index = chunk_index
                 if chunk is not None:
                     self._count_chunk(active, chunk)

@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, cast
 
 from vram_arbiter.runner.recording import commit
 from vram_arbiter.runner.recording.columns import (
@@ -28,17 +28,44 @@ from vram_arbiter.schemas.errors import BadRequest, ConfigError
 ParquetRow = dict[str, Any]
 """One row of a table that lerobot wrote, by column."""
 
-OF_GOAL = ("status", "code", "message", "dropped", "incomplete", "marked")
-OF_TICK = ("index", "stamp_ns", "chunk_index", "action_applied", "deadline_missed", "violations")
+OF_GOAL = {"status", "code", "message", "dropped", "incomplete", "marked"}
+
+
+class Info(TypedDict):
+    """What is read of lerobot's `meta/info.json`."""
+
+    features: Features
+    robot_type: str | None
+    video_path: str
+
+
+class RecordedTick(TypedDict):
+    """Facts of one tick; `chunk_index` is None without a chunk, `success` where nothing judged."""
+
+    index: int
+    stamp_ns: int
+    chunk_index: int | None
+    action_applied: bool
+    deadline_missed: bool
+    violations: str
+    done: bool
+    success: bool | None
+
+
+class RecordedPicture(TypedDict):
+    """Place of a picture: its video's path, the second in it, and the picture's age (ms)."""
+
+    path: str
+    at_s: float
+    age_ms: float
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
     """One frame.
 
-    `state` and `action` are by joint (rad); `timings_ms` by part of the tick; `pictures` maps a
-    camera to its video's path, the second in it and the picture's age (ms). The end of `goal` is
-    that of its episode.
+    `state` and `action` are by joint (rad); `timings_ms` by part of the tick; `pictures` by camera.
+    The end of `goal` is that of its episode.
     """
 
     root: str
@@ -48,16 +75,16 @@ class Recorded:
     frame_in_episode: int
     at_s: float
     task: str
-    goal: Mapping[str, Any]
+    goal: commit.EpisodeNote
     trace_id: str
     span_id: str
     trace_sampled: bool
-    tick: Mapping[str, Any]
+    tick: RecordedTick
     timings_ms: Mapping[str, float]
     state: Mapping[str, float]
     action: Mapping[str, float]
     base: Mapping[str, Mapping[str, float]]
-    pictures: Mapping[str, Mapping[str, Any]]
+    pictures: Mapping[str, RecordedPicture]
     complete: bool  # False: a recording is under way, or was cut off
 
 
@@ -82,7 +109,7 @@ def read_episode(root: Path, episode: int) -> list[Recorded]:
 
 
 def _frames(
-    root: Path, info: dict[str, Any], about: ParquetRow, where: tuple[str, str, int], count: int
+    root: Path, info: Info, about: ParquetRow, where: tuple[str, str, int], count: int
 ) -> list[Recorded]:
     rows = _rows(root, "data", where)
     if len(rows) != count:
@@ -94,12 +121,12 @@ def _frames(
         raise ConfigError(
             f"{root} has the columns of lerobot only, and no ticks", hint="record it in full"
         )
-    noted: dict[int, Mapping[str, Any]] = {note["episode"]: note for note in commit.notes(root)}
-    note = noted.get(about["episode_index"], {})
+    noted = {note["episode"]: note for note in commit.notes(root)}
+    note = noted.get(about["episode_index"], commit.EpisodeNote())
     return [_recorded(root, info, about, row, note) for row in rows]
 
 
-def _info(root: Path) -> dict[str, Any]:
+def _info(root: Path) -> Info:
     if not commit.is_ours(root):
         raise ConfigError(
             f"{root} is not a dataset that this program recorded",
@@ -107,7 +134,7 @@ def _info(root: Path) -> dict[str, Any]:
         )
     path = root / "meta" / "info.json"
     try:
-        info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        info: Info = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ConfigError(
             f"{path} cannot be read: {error}", hint="the next recording into the folder repairs it"
@@ -154,12 +181,12 @@ def _episode(episodes: list[ParquetRow], frame: int, wanted: int | None) -> Parq
 
 def _recorded(
     root: Path,
-    info: dict[str, Any],
+    info: Info,
     about: ParquetRow,
     row: ParquetRow,
-    note: Mapping[str, Any],
+    note: commit.EpisodeNote,
 ) -> Recorded:
-    features: Features = info["features"]
+    features = info["features"]
 
     def named(column: str) -> dict[str, float]:
         values = row.get(column, [])  # of a single number lerobot makes a plain one
@@ -168,7 +195,7 @@ def _recorded(
         return dict(zip(names or [], listed, strict=True))
 
     ages_ms = {camera_column(name): age for name, age in named("tick.camera_ages_ms").items()}
-    pictures = {}
+    pictures: dict[str, RecordedPicture] = {}
     for column, feature in features.items():
         if feature["dtype"] == "video":
             video = info["video_path"].format(
@@ -179,10 +206,19 @@ def _recorded(
             at_s = about[f"videos/{column}/from_timestamp"] + row["timestamp"]
             name, path = column.removeprefix(PICTURES), str(root / video)
             pictures[name] = {"path": path, "at_s": at_s, "age_ms": ages_ms[column]}
-    tick = {name: row[f"tick.{name}"] for name in OF_TICK}
-    if tick["chunk_index"] == NO_CHUNK:
-        tick["chunk_index"] = None
-    told = {name: note[name] for name in OF_GOAL if name in note}
+    chunk_index = row["tick.chunk_index"]
+    tick: RecordedTick = {
+        "index": row["tick.index"],
+        "stamp_ns": row["tick.stamp_ns"],
+        "chunk_index": None if chunk_index == NO_CHUNK else chunk_index,
+        "action_applied": row["tick.action_applied"],
+        "deadline_missed": row["tick.deadline_missed"],
+        "violations": row["tick.violations"],
+        "done": row[DONE],
+        "success": row.get(SUCCESS),
+    }
+    told = {name: said for name, said in note.items() if name in OF_GOAL}
+    goal = {"goal_id": row["goal_id"], "skill": row["skill"], **told}
     return Recorded(
         root=str(root),
         robot=info.get("robot_type") or "",
@@ -191,11 +227,11 @@ def _recorded(
         frame_in_episode=row["frame_index"],
         at_s=row["timestamp"],
         task=str(note.get("task", "")),
-        goal={"goal_id": row["goal_id"], "skill": row["skill"], **told},
+        goal=cast(commit.EpisodeNote, goal),
         trace_id=row["trace_id"],
         span_id=row["span_id"],
         trace_sampled=row["trace_sampled"],
-        tick={**tick, "done": row[DONE], "success": row.get(SUCCESS)},  # None: nothing judged
+        tick=tick,
         timings_ms=named("tick.timings_ms"),
         state=named(STATE),
         action=named(ACTION),

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from vram_arbiter.runner.recording.reader import Recorded, read_episode
+from vram_arbiter.runner.recording.reader import Recorded, RecordedPicture, read_episode
 from vram_arbiter.runner.sensors.pictures import encode
 from vram_arbiter.runner.sensors.ros2_messages import COMPRESSED, stamp_of
 from vram_arbiter.runner.sensors.ros2_types import RosMessage, typestore, write
@@ -66,7 +66,7 @@ def _joints(stamp_ns: int, positions: Mapping[str, float]) -> RosMessage:
     return {"header": header, "name": list(positions), "position": list(positions.values())}
 
 
-def _colors(first: Mapping[str, Any]) -> Iterator[Any]:
+def _colors(first: RecordedPicture) -> Iterator[Any]:
     """Yield the pictures of a video (RGB, uint8), from that of the episode's first row on."""
     import av
 

@@ -347,6 +347,7 @@ def hardware_runner(
     *,
     rate_hz: float = 30.0,
     deadline_policy: DeadlinePolicy = DeadlinePolicy.WARN,
+    latency_budget_ms: float | None = None,
     clock: Clock | None = None,
     topics: Mapping[str, str] | None = None,
     detections: Sequence[DetectionSlot] = (),
@@ -373,5 +374,10 @@ def hardware_runner(
         first_data_s=first_data_s,
     )
     return ControlLoop(
-        robot, rate_hz=rate_hz, deadline_policy=deadline_policy, clock=clock, latch=latch
+        robot,
+        rate_hz=rate_hz,
+        deadline_policy=deadline_policy,
+        latency_budget_ms=latency_budget_ms,
+        clock=clock,
+        latch=latch,
     )

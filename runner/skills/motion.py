@@ -30,16 +30,27 @@ def joint_positions(world: WorldState, names: tuple[str, ...]) -> dict[str, floa
     return {name: known[name] for name in names}
 
 
-def action_of(targets: Mapping[str, float], stamp_ns: int, twist: Twist | None = None) -> Action:
+def action_of(
+    targets: Mapping[str, float],
+    stamp_ns: int,
+    twist: Twist | None = None,
+    confidence: float = 1.0,
+) -> Action:
     """Return an action of joint targets (rad), with a base's velocity, or of that alone."""
     driving = None if twist is None else (twist,)
     if not targets and driving is not None:
-        return Action(control_mode=ControlMode.BODY_TWIST, body_twist=driving, stamp_ns=stamp_ns)
+        return Action(
+            control_mode=ControlMode.BODY_TWIST,
+            body_twist=driving,
+            confidence=confidence,
+            stamp_ns=stamp_ns,
+        )
     return Action(
         control_mode=ControlMode.JOINT_POSITION,
         joint_targets=(tuple(targets.values()),),
         joint_names=tuple(targets),
         body_twist=driving,
+        confidence=confidence,
         stamp_ns=stamp_ns,
     )
 

@@ -77,7 +77,7 @@ STILL_WINDOW = (
 STILL_RAD = 0.01
 STILL_FROM = 0.5  # share of the rollout before which standing still is just waiting
 STATE_KEY, TASK_KEY = "observation.state", "task"
-ACTION_KEY = "action"
+ACTION_KEY, CONFIDENCE_KEY = "action", "confidence"
 
 # The lease went between `load` and the use: load again. Anything else is the goal's failure.
 _AGAIN = (
@@ -154,6 +154,8 @@ class SidecarPolicy(SkillBase):
         self._recent: deque[Row] = deque(maxlen=STILL_WINDOW)
         self._seen: deque[Message] = deque(maxlen=1)  # the policy's history
         self._latency_s = 0.0  # of the newest chunk that was answered
+        self._answered: float | None = None  # its confidence; None: the policy has none
+        self._confidence: float | None = None  # of the chunk that plays
         self._target: dict[str, float] = {}
 
     # -- event loop
@@ -169,6 +171,7 @@ class SidecarPolicy(SkillBase):
         begun = await self._client.reset({TASK_KEY: self._task}, token=self._token)
         rollout = self._wiring.rollout
         self._ramp, self._running, self._commanded = None, goal.from_here, {}
+        self._confidence = None
         self._recent.clear()
         self._seen = deque(maxlen=_count(begun, "n_obs_steps") or rollout.n_obs_steps or 1)
         # of this goal: a late request without a token would load the model anew
@@ -282,6 +285,7 @@ class SidecarPolicy(SkillBase):
             self._latency_s = time.monotonic() - asked_s
             labels = {telemetry.ATTR_SKILL: self.key.rskill_id}
             meters.measure(telemetry.METRIC_CHUNK, self._latency_s, labels)
+            self._answered = _confidence(answer)
             return self._rows(answer)
 
     def _budget(self) -> str:
@@ -329,7 +333,7 @@ class SidecarPolicy(SkillBase):
             self._running = True
             return Hold("at the start pose")
         if player.played >= self._steps or self._stands_still(player):
-            return Done({"steps": player.played, "chunks": player.chunks})
+            return self._done(player)
         if player.wants_observation(self._ahead):
             self._see(self._observation(world, measured))
         played = player.next_row(self._history() if player.wants_observation() else None)
@@ -352,12 +356,14 @@ class SidecarPolicy(SkillBase):
         world: WorldState,
     ) -> StepOutcome:
         """Return what a row comes to from here."""
+        if played.first:
+            self._confidence = self._answered
         start = dict(measured)
         if self._commanded:
             start.update(self._sent() if self._sent is not None else self._commanded)
         step = self._stepper.step(played.row, start)
         if step.terminated:
-            return Done({"steps": player.played, "chunks": player.chunks, "terminated": True})
+            return self._done(player, terminated=True)
         if step.withheld:
             return Hold(step.problem, withheld=True)
         targets = {name: step.targets.get(name, start[name]) for name in self._wiring.joints}
@@ -368,11 +374,20 @@ class SidecarPolicy(SkillBase):
         else:
             self._recent.append(tuple(targets.values()))
         return Act(
-            action_of(targets, world.stamp_ns, step.twist),
+            action_of(
+                targets,
+                world.stamp_ns,
+                step.twist,
+                1.0 if self._confidence is None else self._confidence,
+            ),
             chunk_index=played.chunk,
             chunk=self._chunk_start(played),
             problem=step.problem,
         )
+
+    def _done(self, player: ChunkPlayer, **more: bool) -> Done:
+        told = {} if self._confidence is None else {CONFIDENCE_KEY: self._confidence}
+        return Done({"steps": player.played, "chunks": player.chunks, **told, **more})
 
     def _at_start(self, measured: Mapping[str, float]) -> bool:
         """Return whether the arm is at the start pose; set the next target when not."""
@@ -480,6 +495,24 @@ def _count(begun: JsonMap, name: str) -> int | None:
     """Return what a sidecar says of an episode; None: a server of the field, which does not."""
     found = begun.get(name)
     return found if isinstance(found, int) and found > 0 else None
+
+
+def _confidence(answer: JsonMap) -> float | None:
+    """Return the mean of an answer's `confidence`, which may be by channel; None without one.
+
+    Raises ModelError for numbers outside of 0..1.
+    """
+    import numpy as np
+
+    if (told := answer.get(CONFIDENCE_KEY)) is None:
+        return None
+    try:
+        values = np.asarray(told, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"the policy's confidence is no number: {error}") from error
+    if not values.size or not ((values >= 0) & (values <= 1)).all():
+        raise ModelError(f"the policy's confidence must be 0 to 1, not {told!r:.80}")
+    return float(values.mean())
 
 
 def _picture(frame: SensorFrame, view: View | None) -> Any:

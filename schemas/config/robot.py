@@ -191,6 +191,8 @@ class RobotEnvironment(_Section):
     rate_hz: Annotated[float, Field(gt=0, le=RATE_HZ_MAX, allow_inf_nan=False)] = 30.0
     thumbnail_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 25.0
     deadline_overrun_policy: Literal["warn", "drop", "raise"] = "warn"
+    latency_budget_ms: Positive | None = None
+    """Ticks that take longer are counted as `budget_violations`; null: longer than a period."""
     max_ticks: Annotated[int, Field(gt=0)] | None = None
     save_dir: str | None = None
     """Folder of the recorded dataset; null: nothing is recorded."""

@@ -21,7 +21,6 @@ from vram_arbiter.sidecars.adapters.policy_observations import (
 )
 
 ADAPTER = "gpu_passthrough"
-SIDE_MAX = 64  # pixels a side that are sent to the GPU: every n-th, as a preview would
 
 
 def is_passthrough(manifest: RSkillManifest) -> bool:
@@ -42,7 +41,7 @@ class GpuPassthroughAdapter:
     """The endpoint `get_action`.
 
     It answers `action` (1, D), the joints as they were at the first call since `reset`, and
-    `brightness` (0..1) by picture.
+    `confidence` (3,): the pictures' means of red, green and blue, 0..1.
     """
 
     kind: Literal["vla"] = "vla"
@@ -83,22 +82,23 @@ class GpuPassthroughAdapter:
             return {"ok": True}
         observation = observation_of(call)
         state = _state(observation)
-        brightness = {
-            name: self._brightness(_pixels(observation, name, *size))
-            for name, size in self._sizes.items()
-        }
+        pictures = [_pixels(observation, name, *size) for name, size in self._sizes.items()]
         if self._pose is None or self._pose.shape != state.shape:
             self._pose = state
-        return {"action": self._pose[None], "brightness": brightness}
+        return {"action": self._pose[None], "confidence": self._means(pictures)}
 
-    def _brightness(self, pixels: Any) -> float:
-        """Return the mean of all channels, 0..1, computed on the GPU and awaited."""
+    def _means(self, pictures: list[Any]) -> Any:
+        """Return the means by channel, float32, 0..1: of whole pictures, computed on the GPU and
+        awaited."""
         import numpy as np
         import torch
 
-        rows, columns = (max(1, side // SIDE_MAX) for side in pixels.shape[:2])
-        picture = torch.from_numpy(np.array(pixels[::rows, ::columns])).to(self._device)
-        return float((picture.to(torch.float32) / 255).mean().cpu())
+        uploaded = [torch.from_numpy(np.array(pixels)).to(self._device) for pixels in pictures]
+        # whole numbers: a mean in float32 may be above the brightest pixel
+        by_picture = [one.sum(dim=(0, 1)) / (255 * one[..., 0].numel()) for one in uploaded]
+        means = torch.stack(by_picture).mean(dim=0)
+        torch.get_device_module(means.device).synchronize()
+        return means.cpu().numpy()
 
 
 def _value(observation: JsonMap, name: str) -> Any:

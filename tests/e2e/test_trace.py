@@ -9,7 +9,6 @@ SIGTERM, which has to lose nothing.
 
 import asyncio
 import re
-import signal
 import subprocess
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -25,8 +24,8 @@ from tests.support import promql
 from tests.support.chat_server import chat_server
 from tests.support.collector import Collector, ReceivedSpan
 from tests.support.observer import ObserverProcess
-from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
+from tests.support.programs import Programs
 from vram_arbiter.clients.observer import names as own
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
@@ -38,7 +37,7 @@ pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(280)]
 
 ROOT = Path(__file__).parents[2]
 GRAB = ROOT / "configs/rskills/so101-grab"
-START_S, MOVES_S, STOP_S = 90.0, 120.0, 60.0
+START_S, MOVES_S = 90.0, 120.0
 ARBITER, RUNNER, REASONER = "vram-arbiter", "vram-runner", "vram-reasoner"
 DETECTOR, POLICY = "vram-sidecar-detector", "vram-sidecar-grab"
 DETECTOR_MANIFEST = """
@@ -65,34 +64,6 @@ def decide(asked: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Decide by what was done so far."""
     done = sum(message["role"] == "tool" for message in asked["messages"])
     return DECISIONS[min(done, len(DECISIONS) - 1)]
-
-
-class Programs:
-    """Everything beside the daemon, in its runtime folder, each telling the collector."""
-
-    def __init__(self, arbiter: ArbiterProcess, environ: dict[str, str]) -> None:
-        self.log = arbiter.runtime / "programs.log"
-        self._environ = arbiter.environ | environ
-        self._running: list[Forked] = []
-
-    def start(self, program: str, *argv: str) -> None:
-        with self.log.open("ab") as log:
-            made = start(program, argv, self._environ, log.fileno(), log.fileno(), cwd=ROOT)
-        self._running.append(made)
-
-    def end(self) -> list[int]:
-        """SIGTERM to each, the last started first; their exit codes."""
-        codes = []
-        for process in reversed(self._running):
-            process.send_signal(signal.SIGTERM)
-            codes.append(process.wait(STOP_S))
-        return codes
-
-    def close(self) -> None:
-        for process in self._running:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
 
 
 def test_one_trace_runs_from_the_decision_to_the_first_action(

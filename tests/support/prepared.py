@@ -109,6 +109,7 @@ PROGRAMS: Mapping[str, Program] = {
     "storm-worker": Program("tests.chaos.worker", CLIENT),
     "op-server": Program("tests.support.server_process", server="echo"),
     "dataset-writer": Program("tests.support.dataset_writer", server="vram-sidecar"),
+    "dataset-reader": Program("tests.support.dataset_reader", server="vram-sidecar"),
     "lerobot-train": Program("lerobot.scripts.lerobot_train", server="vram-sidecar"),
 }
 

@@ -90,7 +90,9 @@ METRIC_START_LATE = metric(
     "vram_runner.tick.start_delay", "s", "Late start of a goal's ticks", TICKS_S
 )
 METRIC_DEADLINE_MISSES = metric("vram_runner.tick.deadline_misses", "{tick}", "Ticks over too late")
-METRIC_BUDGET_VIOLATIONS = metric("vram_runner.tick.budget_violations", "{tick}", "Overlong ticks")
+METRIC_BUDGET_VIOLATIONS = metric(
+    "vram_runner.tick.budget_violations", "{tick}", "Ticks longer than latency_budget_ms"
+)
 METRIC_HAL_READ = metric("vram_runner.hal.read.duration", "s", "One reading of the joints", TICKS_S)
 METRIC_HAL_SEND = metric("vram_runner.hal.send.duration", "s", "One action to the motors", TICKS_S)
 METRIC_SENSOR_AGE = metric("vram_runner.sensor.age", "s", "Age of what a tick reads", TICKS_S)
@@ -100,7 +102,9 @@ METRIC_COMPONENTS_STALE = metric(
     "vram_runner.world.components_stale", "{component}", "Components not to be trusted now"
 )
 METRIC_ESTOPS = metric("vram_runner.estops", "{stop}", "Emergency stops")
-METRIC_SAFETY_VIOLATIONS = metric("vram_runner.safety.violations", "{violation}", "Gate reports")
+METRIC_SAFETY_VIOLATIONS = metric(
+    "vram_runner.safety.violations", "{violation}", "Gate reports; error: the action was withheld"
+)
 METRIC_WITHHELD = metric("vram_runner.safety.withheld_actions", "{action}", "Actions not sent")
 METRIC_LOOKS = metric("vram_runner.detector.looks", "{look}", "Looks of continuous detectors")
 METRIC_STALE_DETECTIONS = metric(
@@ -128,6 +132,7 @@ ATTR_BYTES = "vram.bytes"  # spans only
 ATTR_SKILL = "rskill.id"
 ATTR_REVISION = "rskill.revision"
 ATTR_GOAL = "rskill.goal_id"  # spans only
+ATTR_CONFIDENCE = "action.confidence"  # spans only
 ATTR_TOOL = "reasoner.tool"
 ATTR_SENSOR = "vram.sensor"
 ATTR_OPERATION = "sidecar.operation"

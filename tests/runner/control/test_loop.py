@@ -137,6 +137,13 @@ def test_a_tick_that_began_late_misses_its_deadline_within_its_budget() -> None:
     assert (result.metadata["deadline_misses"], result.budget_violations) == (1, 0)
 
 
+def test_a_tick_that_ends_in_time_may_exceed_a_budget_of_its_own(clock: Any) -> None:
+    """As on a robot whose load is to be noticed before its ticks come late."""
+    runner, _ = scripted(clock, [0.01, 0.04, 0.02], rate_hz=10, latency_budget_ms=30)
+    result = runner.run(max_ticks=3)
+    assert (result.metadata["deadline_misses"], result.budget_violations) == (0, 1)
+
+
 def test_warn_applies_a_late_action_and_counts_it(clock: Any) -> None:
     runner, _ = scripted(clock, [0.25], rate_hz=10, deadline_policy=DeadlinePolicy.WARN)
     result = runner.tick()

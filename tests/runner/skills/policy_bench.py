@@ -59,6 +59,7 @@ class Sidecar:
         self.answer: Message = {}  # what it says beside actions
         self.serial = 1
         self.action: Any = None
+        self.confidence: list[Any] = []  # of the next chunks
         self.error: VramError | None = None
         self.load_error: VramError | None = None
         self.arbitrated = True
@@ -119,6 +120,8 @@ class Sidecar:
             action = np.array([[number, i] for i in range(3)], dtype=np.float32) / 100
             reply = {"action": npy.pack(self.action if self.action is not None else action)}
             reply |= self.answer
+            if self.confidence:
+                reply["confidence"] = npy.pack(self.confidence.pop(0))
         elif endpoint == "ping":
             await asyncio.sleep(self.late_s)
             reply = {

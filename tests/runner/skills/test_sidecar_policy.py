@@ -278,6 +278,42 @@ async def test_without_an_arbiter_no_use_is_marked(policy_bench: Callable[..., B
         assert set(map(str, b.sidecar.tokens)) == {"None"}
 
 
+async def test_a_policys_confidence_goes_with_the_actions_of_its_chunk(
+    manifest: RSkillManifest, tmp_path: Path
+) -> None:
+    """Also where the next chunk is there before its first row is due."""
+    import numpy as np
+
+    early = manifest.model_copy(
+        update={"policy_extras": manifest.policy_extras | {"prefetch_at": 1, "rollout_steps": 6}}
+    )
+    async with served(Bench(early, f"ipc://{tmp_path}/grab.sock", Arbiter())) as b:
+        b.sidecar.confidence = [np.array([0.25, 0.5, 0.75]), 0.125]  # the third chunk has none
+        await b.skill.start(GOAL)
+        told: dict[int | None, set[float]] = {}
+        while not isinstance(outcome := await b.step(), Done):
+            if isinstance(outcome, Act):
+                told.setdefault(outcome.chunk_index, set()).add(outcome.action.confidence)
+    assert told == {0: {0.5}, 1: {0.125}, 2: {1.0}}
+    assert "confidence" not in outcome.data
+
+
+async def test_a_goal_says_its_last_confidence(b: Bench) -> None:
+    b.sidecar.confidence = [0.25, 0.5, 0.75]
+    await b.skill.start(GOAL)
+    _, done = await b.play()
+    assert done.data == {"steps": 7, "chunks": 3, "confidence": 0.75}
+
+
+@pytest.mark.parametrize("confidence", [1.5, -0.1, float("nan"), "sure", []])
+async def test_a_confidence_that_is_none_stops_the_goal(b: Bench, confidence: Any) -> None:
+    b.sidecar.confidence = [confidence]
+    await b.skill.start(GOAL)
+    await b.step()
+    with pytest.raises(ModelError, match="confidence"):
+        await b.step()
+
+
 @pytest.mark.parametrize(
     "action",
     [[[float("nan"), 0.0]], [[0.0, float("inf")]], [[0.0, 0.0, 0.0]], [0.0, 0.0], [], "left"],

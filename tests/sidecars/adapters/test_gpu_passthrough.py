@@ -30,8 +30,9 @@ def call(endpoint: str, observation: Any = None) -> EndpointCall:
 def observation(**changes: Any) -> dict[str, Any]:
     import numpy as np
 
-    picture = np.zeros((100, 200, 3), dtype=np.uint8)
-    picture[:, 100:] = 255
+    picture = np.zeros((128, 256, 3), dtype=np.uint8)
+    picture[:, 128:] = 255
+    picture[::2, ::2, 2] = 255  # a picture that is thinned by two would be all blue
     return {
         "observation.state": np.array([0.1, -0.2, 0.3]),
         FRONT: picture,
@@ -54,11 +55,20 @@ def test_the_arm_keeps_the_pose_it_had_at_first(adapter: GpuPassthroughAdapter) 
 
     first = adapter.run(call("get_action", observation()))
     assert first["action"].tolist() == [pytest.approx([0.1, -0.2, 0.3])]
-    assert first["brightness"] == {FRONT: pytest.approx(0.5, abs=0.01)}
+    assert first["confidence"].tolist() == pytest.approx([0.5, 0.5, 0.625])
     sagged = observation(**{"observation.state": np.array([0.1, -0.25, 0.3])})
     assert adapter.run(call("get_action", sagged))["action"][0, 1] == pytest.approx(-0.2)
     adapter.run(call("reset"))
     assert adapter.run(call("get_action", sagged))["action"][0, 1] == pytest.approx(-0.25)
+
+
+def test_a_white_picture_is_one_and_no_more(adapter: GpuPassthroughAdapter) -> None:
+    """In float32 a mean of many pixels may exceed them, and no confidence is above 1."""
+    import numpy as np
+
+    white = np.full((1440, 2561, 3), 255, dtype=np.uint8)
+    answer = adapter.run(call("get_action", observation(**{FRONT: white})))
+    assert answer["confidence"].tolist() == [1.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize(
