@@ -98,7 +98,7 @@ class ServerConfig(_Section):
         return self
 
 
-class LimitsConfig(_Section):
+class ClientLimits(_Section):
     """What clients may take of the gateway itself."""
 
     body_max_bytes: Annotated[ByteSize, Field(ge=1024, le=1 << 34)] = 256 << 20
@@ -128,7 +128,7 @@ class GatewayConfig(_Section):
     """A request with `stream: true` that waits is answered 200 and gets a comment line
     (server-sent events) this often, so that its client does not time out; a failure is an `error`
     event then. Null: nothing is answered before the server does."""
-    limits: LimitsConfig = LimitsConfig()
+    limits: ClientLimits = ClientLimits()
     servers: Annotated[dict[Name, ServerConfig], Field(min_length=1, max_length=256)]
     """Model servers by name."""
 

@@ -20,6 +20,7 @@ import yaml
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.config.gateway import PARALLEL_MAX, PRIORITY, load_gateway
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.units import parse_bytes
 from vram_arbiter.schemas.urls import http_url
@@ -37,7 +38,7 @@ _ENV = re.compile(r"\$\{env\.([A-Za-z_][A-Za-z0-9_]*)\}")
 _MACRO = re.compile(r"\$\{([A-Za-z0-9_-]+)\}")
 _AS_IT_IS = "a body is passed on as it is"
 _WHY: Final[Mapping[str, str]] = {
-    "apiKeys": "secrets are not copied; write them into a file of mode 0600 and name it `keys_file`",
+    "apiKeys": "secrets are not copied; write them into a file of mode 0600, named by `keys_file`",
     "cmdStop": "the process is ended by SIGTERM",
     "evict_costs": "the arbiter measures what a return costs",
     "filters": _AS_IT_IS,
@@ -70,18 +71,18 @@ class _Reader:
     """One conversion. `macros`: the file's own. `sizes`: `vram` by model, "" for all others."""
 
     sizes: Mapping[str, str]
-    macros: Mapping[str, Any]
+    macros: JsonMap
     defaults: dict[str, Any]
     left: list[str] = field(default_factory=list)
     noted: list[str] = field(default_factory=list)
 
-    def leave(self, keys: Mapping[str, Any], known: Sequence[str], path: str = "") -> None:
+    def leave(self, keys: JsonMap, known: Sequence[str], path: str = "") -> None:
         """Name the keys that are not in `known`."""
         for key in keys:
             if key not in known:
                 self.left.append(f"{path}{key}: {_WHY.get(key, 'no counterpart')}")
 
-    def server(self, model: str, given: Mapping[str, Any]) -> dict[str, Any] | None:
+    def server(self, model: str, given: JsonMap) -> dict[str, Any] | None:
         """Return one server; None if it is left out as a whole. Raises ConfigError."""
         path = f"models.{model}."
         macros = (
@@ -119,7 +120,7 @@ class _Reader:
             self.left.append(f"{path}vram: not known; measure it with `vramctl calibrate`, --vram")
         return made
 
-    def _optional(self, given: Mapping[str, Any], path: str) -> dict[str, Any]:
+    def _optional(self, given: JsonMap, path: str) -> dict[str, Any]:
         made: dict[str, Any] = {}
         if variables := _list(given, "env"):
             pairs = (str(one).replace("${PORT}", "{port}").partition("=") for one in variables)
@@ -134,7 +135,7 @@ class _Reader:
             made["health"] = health
         return made
 
-    def priorities(self, data: Mapping[str, Any]) -> dict[str, int]:
+    def priorities(self, data: JsonMap) -> dict[str, int]:
         """Return priorities of leases by model; say what replaces groups and matrix."""
         routing = _map(data.get("routing"), "routing")
         router, scheduler = (_map(routing.get(key), key) for key in ("router", "scheduler"))
@@ -188,7 +189,7 @@ def convert(
     return Converted(_HEADER.format(Path(source.name).name) + text, reader.left, reader.noted)
 
 
-def _check(head: Mapping[str, Any], servers: Mapping[str, Any], name: str) -> None:
+def _check(head: JsonMap, servers: JsonMap, name: str) -> None:
     """Raises ConfigError where the gateway would not read the result, but for missing sizes."""
     sized = {name: {"vram": "1GiB"} | server for name, server in servers.items()}
     text = yaml.safe_dump(dict(head) | {"servers": sized}, sort_keys=False)
@@ -196,7 +197,7 @@ def _check(head: Mapping[str, Any], servers: Mapping[str, Any], name: str) -> No
 
 
 # -- values
-def _expanded(value: Any, macros: Mapping[str, Any]) -> Any:
+def _expanded(value: Any, macros: JsonMap) -> Any:
     def expand(text: str) -> Any:
         for name, content in reversed(list(macros.items())):
             if text == f"${{{name}}}" and not isinstance(content, str):
@@ -251,14 +252,14 @@ def _map(value: Any, name: str) -> dict[str, Any]:
     return dict(value or {})
 
 
-def _list(given: Mapping[str, Any], key: str) -> list[Any]:
+def _list(given: JsonMap, key: str) -> list[Any]:
     """Raises ConfigError."""
     if not isinstance(given.get(key) or [], list):
         raise ConfigError(f"{key}: expected a list, got {given[key]!r}")
     return list(given.get(key) or [])
 
 
-def _number(given: Mapping[str, Any], key: str, otherwise: int = 0) -> int:
+def _number(given: JsonMap, key: str, otherwise: int = 0) -> int:
     """Raises ConfigError."""
     value = given.get(key, otherwise)
     if not isinstance(value, int):
