@@ -7,6 +7,8 @@ GPU ?= fake:8GiB
 OUT ?= out/demo
 ARGS ?=
 QUICK ?=
+# Minutes of turns on each program of `make bench-gateway`.
+MINUTES ?= 10
 # Seconds of `make chaos`.
 SECONDS ?= 300
 # Histories of `make nightly`, of all rule machines together; MACHINE: one of them alone.
@@ -26,7 +28,7 @@ BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help setup setup-core setup-worlds jetson demo test test-core test-gpu nightly mutation measure lint format \
-	chaos sim bench bench-switch schemas docs clean
+	chaos sim bench bench-gateway bench-switch schemas docs clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -90,6 +92,9 @@ bench: setup ## latencies beside bare ZeroMQ and Redis locks: QUICK=1 is shorter
 
 bench-switch: setup ## how fast a model of 500 MB is loaded, restored and evicted: QUICK=1 is shorter
 	$(TOOL) tests/bench/bench_switch.py $(if $(QUICK),--quick) $(ARGS)
+
+bench-gateway: setup ## what the gateway adds, and two servers in room for one: MINUTES=10
+	$(TOOL) tests/bench/gateway.py --minutes $(MINUTES) $(ARGS)
 
 schemas: setup ## write the JSON Schemas after a model changed
 	$(BIN)/python -m vram_arbiter.schemas export schemas/json

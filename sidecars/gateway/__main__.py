@@ -24,7 +24,7 @@ EXIT_FAILED, EXIT_USAGE, EXIT_UNREACHABLE = 1, 2, 3
 _EPILOG = """\
 exit codes:
   0   stopped by SIGTERM or SIGINT, or nothing wrong was found
-  1   the arbiter refuses it
+  1   the arbiter refuses it; `import` left something out; `demo`: a request failed
   2   wrong flags or configuration, or the extra `gateway` is not installed
   3   no arbiter answers
 """
@@ -54,6 +54,9 @@ def parser() -> argparse.ArgumentParser:
     convert = commands.add_parser("import", help="convert a configuration of llama-swap")
     imports.add_arguments(convert)
     convert.set_defaults(run=imports.run)
+    show = commands.add_parser("demo", help="two stand-in servers take turns on a simulated GPU")
+    show.add_argument("--no-browser", action="store_true", help="print the page's address alone")
+    show.set_defaults(run=_demo)
     return made
 
 
@@ -85,6 +88,13 @@ def _serve(args: argparse.Namespace) -> int:
     with command(PROGRAM, "serve", serves=True):
         asyncio.run(gateway.run(config, args.endpoint))
     return 0
+
+
+def _demo(args: argparse.Namespace) -> int:
+    need(PROGRAM, "aiohttp", extra="gateway")
+    from vram_arbiter.sidecars.gateway import demo
+
+    return demo.run(browser=not args.no_browser)
 
 
 @terminal.program

@@ -18,6 +18,7 @@ from urllib.request import urlopen
 
 import yaml
 
+from tests.bench.harness import free_port
 from tests.support.waiting import until
 from vram_arbiter.schemas.runtime import fakegpu_folder
 
@@ -147,7 +148,7 @@ def _serving(program: Path, models: Mapping[str, Sequence[str]], folder: Path) -
         "vram_reserve_mib": 600,
     }
     (folder / "catalog.yaml").write_text(yaml.safe_dump({"defaults": defaults, "models": entries}))
-    url = f"http://127.0.0.1:{_free_port()}"
+    url = f"http://127.0.0.1:{free_port()}"
     config = {
         "catalog": f"{folder}/catalog.yaml",
         "db": f"{folder}/broker.db",
@@ -184,12 +185,3 @@ def _answers(url: str) -> bool:
             return True
     except OSError as error:
         return hasattr(error, "code")  # whatever it says, it serves
-
-
-def _free_port() -> int:
-    import socket
-
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        port: int = found.getsockname()[1]
-        return port

@@ -108,6 +108,22 @@ def test_the_runners_ticks_are_measured_beside_real_sidecars(tmp_path: Path) -> 
     assert jitter["ok"] == (float(str(jitter["p99_us"])) < 2000)
 
 
+@pytest.mark.e2e
+@pytest.mark.nightly
+def test_the_gateway_is_measured_beside_a_plain_proxy(tmp_path: Path) -> None:
+    out = tmp_path / "gateway.json"
+    subprocess.run(
+        [sys.executable, str(HERE / "gateway.py"), "--minutes", "0.1", "--out", str(out)],
+        env=os.environ | {"PYTHONPATH": f"{HERE.parents[1]}/src:{HERE.parents[1]}"},
+        check=True,
+    )
+    rows = {row["name"]: row for row in json.loads(out.read_text())}
+    assert rows["turns, gateway: failed"]["ok"]
+    for name in ("gateway", "plain proxy"):
+        assert rows[f"turns, {name}: requests"]["value"] >= 32
+        assert rows[f"turns, {name}: gap at a switch"]["p50_us"] > 0
+
+
 def test_a_costly_message_is_timed() -> None:
     """The row called a function that had changed, and no test ran it."""
     assert cost_us(COSTLY["a long key"]) > 0
