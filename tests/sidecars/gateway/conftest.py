@@ -45,14 +45,16 @@ class GatewayProcess:
         assert self.process.stdout is not None
         self.url = self.process.stdout.readline().decode().strip()
         assert self.url, (folder / "gateway.log").read_text()
+        # One for all: each new one reads the certificates of the machine for 60 ms of a core.
+        self.client = httpx.Client(base_url=self.url, timeout=PATIENCE_S)
 
     def running(self) -> dict[str, dict[str, Any]]:
         """What `/running` says, by server."""
-        found = httpx.get(f"{self.url}/running", timeout=PATIENCE_S).json()["running"]
+        found = self.client.get("/running").json()["running"]
         return {one["model"]: one for one in found}
 
     def logs(self) -> str:
-        return httpx.get(f"{self.url}/logs", timeout=PATIENCE_S).text
+        return self.client.get("/logs").text
 
     def let(self, user: str, *numbers: int) -> None:
         """Let a stand-in go on with these words of a chat."""
@@ -60,6 +62,7 @@ class GatewayProcess:
             (self.folder / f"{user}.{number}").touch()
 
     def close(self) -> None:
+        self.client.close()
         self.process.send_signal(signal.SIGTERM)
         try:
             self.process.wait(PATIENCE_S)

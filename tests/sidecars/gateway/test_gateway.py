@@ -47,7 +47,7 @@ def alive(pid: int) -> bool:
 
 
 def pid_of(gateway: GatewayProcess, name: str) -> int:
-    return int(httpx.get(f"{gateway.url}/upstream/{name}/x", timeout=PATIENCE_S).json()["pid"])
+    return int(gateway.client.get(f"/upstream/{name}/x").json()["pid"])
 
 
 async def eventually(condition: Callable[[], object]) -> None:
@@ -127,7 +127,7 @@ async def test_a_sleeping_server_wakes_for_a_request_and_not_before(
         for _ in range(2):
             await asyncio.to_thread(pid_of, started, "b")
             assert view_of(arbiter, "a").state == "parked"
-            unload = await asyncio.to_thread(httpx.get, f"{started.url}/unload?model=b")
+            unload = await asyncio.to_thread(started.client.get, "/unload?model=b")
             assert unload.status_code == 200
             await eventually(lambda: not started.running())  # `a` sleeps on beside an empty GPU
             assert await asyncio.to_thread(pid_of, started, "a") == pid
