@@ -29,7 +29,7 @@ class GatewayProcess:
     """`vram-gateway serve`. `url`: what it printed."""
 
     def __init__(self, arbiter: ArbiterProcess, config: dict[str, Any], folder: Path) -> None:
-        self.folder = arbiter.gpu_folder
+        self.arbiter, self.folder = arbiter, arbiter.gpu_folder
         path = folder / "gateway.yaml"
         text = yaml.safe_dump(config)
         assert len(text) < TEXT_MAX_BYTES
@@ -103,3 +103,24 @@ def gateway(
     yield start
     for one in made:
         one.close()
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GatewayProcess]:
+    """One gateway and daemon for the tests of a file: either of the servers `a` and `b` fits."""
+    arbiter = ArbiterProcess(prepared=True)
+    try:
+        arbiter.start()
+        config = {
+            "listen": "127.0.0.1:0",
+            "servers": {name: stand_in(arbiter, 5) for name in "ab"},
+            "keep_alive_s": 0.05,
+            "limits": {"body_max_bytes": "2MiB"},
+        }
+        started = GatewayProcess(arbiter, config, tmp_path_factory.mktemp("gateway"))
+        try:
+            yield started
+        finally:
+            started.close()
+    finally:
+        arbiter.close()
