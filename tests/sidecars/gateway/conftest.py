@@ -29,7 +29,7 @@ class GatewayProcess:
     """`vram-gateway serve`. `url`: what it printed."""
 
     def __init__(self, arbiter: ArbiterProcess, config: dict[str, Any], folder: Path) -> None:
-        self.folder = arbiter.gpu_folder
+        self.arbiter, self.folder = arbiter, arbiter.gpu_folder
         path = folder / "gateway.yaml"
         text = yaml.safe_dump(config)
         assert len(text) < TEXT_MAX_BYTES
@@ -45,14 +45,16 @@ class GatewayProcess:
         assert self.process.stdout is not None
         self.url = self.process.stdout.readline().decode().strip()
         assert self.url, (folder / "gateway.log").read_text()
+        # One for all: each new one reads the certificates of the machine for 60 ms of a core.
+        self.client = httpx.Client(base_url=self.url, timeout=PATIENCE_S)
 
     def running(self) -> dict[str, dict[str, Any]]:
         """What `/running` says, by server."""
-        found = httpx.get(f"{self.url}/running", timeout=PATIENCE_S).json()["running"]
+        found = self.client.get("/running").json()["running"]
         return {one["model"]: one for one in found}
 
     def logs(self) -> str:
-        return httpx.get(f"{self.url}/logs", timeout=PATIENCE_S).text
+        return self.client.get("/logs").text
 
     def let(self, user: str, *numbers: int) -> None:
         """Let a stand-in go on with these words of a chat."""
@@ -60,6 +62,7 @@ class GatewayProcess:
             (self.folder / f"{user}.{number}").touch()
 
     def close(self) -> None:
+        self.client.close()
         self.process.send_signal(signal.SIGTERM)
         try:
             self.process.wait(PATIENCE_S)
@@ -100,3 +103,24 @@ def gateway(
     yield start
     for one in made:
         one.close()
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GatewayProcess]:
+    """One gateway and daemon for the tests of a file: either of the servers `a` and `b` fits."""
+    arbiter = ArbiterProcess(prepared=True)
+    try:
+        arbiter.start()
+        config = {
+            "listen": "127.0.0.1:0",
+            "servers": {name: stand_in(arbiter, 5) for name in "ab"},
+            "keep_alive_s": 0.05,
+            "limits": {"body_max_bytes": "2MiB"},
+        }
+        started = GatewayProcess(arbiter, config, tmp_path_factory.mktemp("gateway"))
+        try:
+            yield started
+        finally:
+            started.close()
+    finally:
+        arbiter.close()

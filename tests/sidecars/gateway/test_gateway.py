@@ -47,7 +47,7 @@ def alive(pid: int) -> bool:
 
 
 def pid_of(gateway: GatewayProcess, name: str) -> int:
-    return int(httpx.get(f"{gateway.url}/upstream/{name}/x", timeout=PATIENCE_S).json()["pid"])
+    return int(gateway.client.get(f"/upstream/{name}/x").json()["pid"])
 
 
 async def eventually(condition: Callable[[], object]) -> None:
@@ -76,26 +76,23 @@ async def test_the_first_request_starts_its_server_and_an_idle_one_leaves(
     assert "a: serves on" in started.logs()
 
 
-async def test_an_eviction_waits_for_a_stream_and_equals_take_turns(
-    gateway: Start, arbiter_daemon: ArbiterProcess
-) -> None:
+async def test_an_eviction_waits_for_a_stream_and_equals_take_turns(shared: GatewayProcess) -> None:
     """The arbiter counts the stream as a use; the next request of the evicted one brings it
     back."""
-    started = gateway({name: stand_in(arbiter_daemon, 5) for name in "ab"})
-    async with openai_client(started) as client:
+    async with openai_client(shared) as client:
         stream = await client.chat.completions.create(
             model="a", messages=HELLO, stream=True, max_tokens=3, user="u"
         )
-        started.let("u", 0)
+        shared.let("u", 0)
         words = aiter(stream)
         assert (await anext(words)).choices[0].delta.content == "0 "
         other = asyncio.create_task(ask(client, "b"))
-        await eventually(lambda: started.running()["a"]["lease"] == "leaving")
+        await eventually(lambda: shared.running()["a"]["lease"] == "leaving")
         late = asyncio.create_task(ask(client, "a"))  # waits for the next turn of `a`
-        await eventually(lambda: started.running()["a"]["waiting"] == 1)
-        with Client("t", endpoint=arbiter_daemon.endpoint) as arbiter:
+        await eventually(lambda: shared.running()["a"]["waiting"] == 1)
+        with Client("t", endpoint=shared.arbiter.endpoint) as arbiter:
             assert view_of(arbiter, "a").uses == 1
-        started.let("u", 1, 2)
+        shared.let("u", 1, 2)
         assert [chunk.choices[0].delta.content async for chunk in words] == ["1 ", "2 "]
         assert await other == "word word "
         assert await late == "word word "
@@ -127,7 +124,7 @@ async def test_a_sleeping_server_wakes_for_a_request_and_not_before(
         for _ in range(2):
             await asyncio.to_thread(pid_of, started, "b")
             assert view_of(arbiter, "a").state == "parked"
-            unload = await asyncio.to_thread(httpx.get, f"{started.url}/unload?model=b")
+            unload = await asyncio.to_thread(started.client.get, "/unload?model=b")
             assert unload.status_code == 200
             await eventually(lambda: not started.running())  # `a` sleeps on beside an empty GPU
             assert await asyncio.to_thread(pid_of, started, "a") == pid
@@ -162,20 +159,19 @@ async def test_a_thousand_waiting_clients_are_all_served(
 
 # -- ends
 async def test_a_client_that_leaves_cancels_its_request_and_gives_up_its_place(
-    gateway: Start, arbiter_daemon: ArbiterProcess
+    shared: GatewayProcess,
 ) -> None:
-    started = gateway({name: stand_in(arbiter_daemon, 5) for name in "ab"})
-    async with openai_client(started) as client:
+    async with openai_client(shared) as client:
         first = asyncio.create_task(ask(client, "a", user="never"))
-        await eventually(lambda: started.running().get("a", {}).get("in_flight") == 1)
+        await eventually(lambda: shared.running().get("a", {}).get("in_flight") == 1)
         second = asyncio.create_task(ask(client, "b"))
-        await eventually(lambda: started.running().get("b", {}).get("lease") == "queued")
+        await eventually(lambda: shared.running().get("b", {}).get("lease") == "queued")
         second.cancel()
-        await eventually(lambda: "b" not in started.running())
-        with Client("t", endpoint=arbiter_daemon.endpoint) as arbiter:
+        await eventually(lambda: "b" not in shared.running())
+        with Client("t", endpoint=shared.arbiter.endpoint) as arbiter:
             await eventually(lambda: [lease.consumer for lease in arbiter.status().leases] == ["a"])
         first.cancel()
-        await eventually(lambda: started.running()["a"]["in_flight"] == 0)
+        await eventually(lambda: shared.running()["a"]["in_flight"] == 0)
 
 
 async def test_a_request_that_does_not_end_is_ended_after_the_grace(
@@ -300,21 +296,16 @@ async def test_beyond_the_queue_and_the_wait_the_reason_is_said(
         assert " a" in raised.value.body["why"]
 
 
-async def test_a_streaming_client_hears_while_it_waits(
-    gateway: Start, arbiter_daemon: ArbiterProcess
-) -> None:
-    started = gateway(
-        {"a": stand_in(arbiter_daemon, 5), "b": stand_in(arbiter_daemon, 5)}, keep_alive_s=0.05
-    )
-    async with openai_client(started) as client:
-        stuck = asyncio.create_task(ask(client, "a", user="u"))
-        await eventually(lambda: started.running().get("a", {}).get("in_flight") == 1)
+async def test_a_streaming_client_hears_while_it_waits(shared: GatewayProcess) -> None:
+    async with openai_client(shared) as client:
+        stuck = asyncio.create_task(ask(client, "a", user="listener"))
+        await eventually(lambda: shared.running().get("a", {}).get("in_flight") == 1)
         async with client.chat.completions.with_streaming_response.create(
             model="b", messages=HELLO, stream=True
         ) as response:
             lines = response.iter_lines()
             assert await anext(lines) == ": waiting"
-            started.let("u", 0)
+            shared.let("listener", 0)
             assert [line async for line in lines][-2:] == ["data: [DONE]", ""]
         await stuck
 
@@ -375,14 +366,8 @@ async def test_keys_limit_who_may_use_what(
     assert "x-api-key" not in {name.lower() for name in echoed["headers"]}
 
 
-async def test_bodies_pass_unchanged_and_within_bounds(
-    gateway: Start, arbiter_daemon: ArbiterProcess
-) -> None:
-    started = gateway(
-        {"a": stand_in(arbiter_daemon, 1), "b": stand_in(arbiter_daemon, 1)},
-        limits={"body_max_bytes": "2MiB"},
-    )
-    async with httpx.AsyncClient(timeout=PATIENCE_S, base_url=started.url) as client:
+async def test_bodies_pass_unchanged_and_within_bounds(shared: GatewayProcess) -> None:
+    async with httpx.AsyncClient(timeout=PATIENCE_S, base_url=shared.url) as client:
         form = {"model": "a", "more": "x"}
         sent = await client.post("/v1/audio", data=form, files={"file": b"R" * 1_000_000})
         assert sent.json()["bytes"] == int(sent.request.headers["content-length"])
@@ -424,20 +409,17 @@ def rss_bytes(pid: int) -> int:
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
 
 
-async def test_a_websocket_passes_and_does_not_keep_its_server(
-    gateway: Start, arbiter_daemon: ArbiterProcess
-) -> None:
-    started = gateway({"a": stand_in(arbiter_daemon, 5), "b": stand_in(arbiter_daemon, 5)})
+async def test_a_websocket_passes_and_does_not_keep_its_server(shared: GatewayProcess) -> None:
     async with (
         aiohttp.ClientSession() as session,
-        session.ws_connect(f"{started.url}/upstream/a/ws", protocols=("chat",)) as socket,
+        session.ws_connect(f"{shared.url}/upstream/a/ws", protocols=("chat",)) as socket,
     ):
         assert socket.protocol == "chat"
         await socket.send_str("hi")
         assert await socket.receive_str() == "echo hi"
         await socket.send_bytes(b"\0" * 100_000)
         assert len(await socket.receive_bytes()) == 100_000
-        async with openai_client(started) as client:
+        async with openai_client(shared) as client:
             assert await ask(client, "b") == "word word "
         with contextlib.suppress(ConnectionError):
             assert (await socket.receive()).type is aiohttp.WSMsgType.CLOSE
