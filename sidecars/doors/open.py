@@ -18,7 +18,6 @@ from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.heap import give_back_freed_memory
-from vram_arbiter.sidecars.doors.offers import Offers
 from vram_arbiter.sidecars.port import on_port
 
 type Protocol = Literal["lerobot", "openpi"]
@@ -87,6 +86,8 @@ async def opened(
 
     Raises ConfigError for a port that cannot be had.
     """
+    from vram_arbiter.sidecars.doors.offers import Offers
+
     give_back_freed_memory()
     path = path_of(endpoint).with_suffix(f".{door.protocol}")
     path.unlink(missing_ok=True)  # of a process that was killed: the endpoint is ours alone
