@@ -10,10 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import aiohttp
 import httpx
 import openai
 import pytest
+
+pytest.importorskip("aiohttp", reason="the extra `gateway`")
+
+import aiohttp
 
 from tests.sidecars.gateway.conftest import KEY, PATIENCE_S, GatewayProcess, stand_in
 from tests.support.leases import view_of
