@@ -35,7 +35,7 @@ class Control:
         try:
             while line := await reader.readline():
                 yield str(json.loads(line))
-        except (OSError, ValueError):  # what cannot be read is no better than its end
+        except (OSError, ValueError):  # a line that cannot be read ends the program, too
             return
 
     def tell(self, state: str, lease_id: str, token: Sequence[int], gpu: str, reason: str) -> None:

@@ -509,7 +509,7 @@ def _confidence(answer: JsonMap) -> float | None:
     try:
         values = np.asarray(told, dtype=float)
     except (TypeError, ValueError) as error:
-        raise ModelError(f"the policy's confidence is no number: {error}") from error
+        raise ModelError(f"the policy's confidence is not a number: {error}") from error
     if not values.size or not ((values >= 0) & (values <= 1)).all():
         raise ModelError(f"the policy's confidence must be 0 to 1, not {told!r:.80}")
     return float(values.mean())

@@ -6,11 +6,13 @@ listens, and runs until SIGTERM. Its parts:
 - `routing`: body → model's name → server; pure.
 - `turns`: which waiting request is next; pure.
 - `keys`: who asks, and for what it may; pure.
-- `program`: one model server under one lease, as a child `vramctl run --report`.
+- `program`: one model server under one lease, as a child `vramctl run --control`.
 - `server`: the states of one server, and the requests that wait for it.
 - `proxy`: bytes both ways, HTTP and WebSocket.
 - `front`: llama-swap's endpoints, limits, errors.
 - `gateway`: all of it joined; `__main__`: the command line.
+- `imports`: llama-swap's configuration → the gateway's; pure, but for its command.
+- `demo`, `stand_in`: simulated users of two stand-in servers.
 
 It must not import the daemon: a lease is `vramctl run`'s, which requests in flight use by its
 token.

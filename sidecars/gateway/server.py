@@ -244,7 +244,7 @@ class Server:
         elif program.state in ASLEEP and self.waiting:
             program.want()
         elif program.state == "queued" and not self.waiting and not program.granted:
-            program.end()  # give up its place: nobody waits
+            program.end()  # give up its place: no request waits
 
     def _changed(self) -> None:
         """Note that the program reported a state."""

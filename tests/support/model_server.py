@@ -14,10 +14,11 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from types import FrameType
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
+
+from tests.support.held_bytes import HeldBytes
 
 
 @dataclass
@@ -160,24 +161,14 @@ class ModelServer:
 
 
 def main(folder: str, size: str, host: str, port: str, *broken: str) -> None:
-    from vram_arbiter.sidecars.device.fake import FakeMemory
-
-    memory = FakeMemory(Path(folder), "server")
-    blocks = [memory.allocate("weights", int(size))]
-
-    def free() -> None:
-        memory.free(blocks.pop())
-        memory.empty_cache()
-
-    def load() -> None:
-        blocks.append(memory.allocate("weights", int(size)))
+    held = HeldBytes(folder, size)
 
     def end(number: int, frame: FrameType | None) -> None:
-        memory.close()
+        held.close()
         sys.exit(0)
 
     signal.signal(signal.SIGTERM, end)
-    with ModelServer(free, load, (host, int(port))) as server:
+    with ModelServer(held.free, held.load, (host, int(port))) as server:
         server.broken = dict.fromkeys(broken, 500)
         print(os.getpid(), flush=True)
         signal.pause()

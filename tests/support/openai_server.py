@@ -18,6 +18,8 @@ from typing import Any
 
 from aiohttp import WSMsgType, web
 
+from tests.support.held_bytes import HeldBytes
+
 POLL_S = 0.01
 
 
@@ -113,20 +115,9 @@ async def serve(server: OpenAiServer, port: int) -> None:
 
 
 def main(folder: str, size: str, port: str) -> None:
-    from vram_arbiter.sidecars.device.fake import FakeMemory
-
-    memory = FakeMemory(Path(folder), "server")
-    blocks = [memory.allocate("weights", int(size))]
-
-    def free() -> None:
-        memory.free(blocks.pop())
-        memory.empty_cache()
-
-    def load() -> None:
-        blocks.append(memory.allocate("weights", int(size)))
-
-    asyncio.run(serve(OpenAiServer(Path(folder), free, load), int(port)))
-    memory.close()
+    held = HeldBytes(folder, size)
+    asyncio.run(serve(OpenAiServer(Path(folder), held.free, held.load), int(port)))
+    held.close()
 
 
 if __name__ == "__main__":
