@@ -16,6 +16,7 @@ from typing import Final, Self
 from vram_arbiter.clients.foreign.control import REST, WANT
 from vram_arbiter.schemas.config.gateway import ServerConfig
 from vram_arbiter.schemas.ids import Token
+from vram_arbiter.schemas.runtime.ports import free_port
 from vram_arbiter.schemas.runtime.printable import printable_lines
 
 LINES_MAX: Final = 1000
@@ -194,10 +195,3 @@ def arguments(name: str, config: ServerConfig, port: int, endpoint: str, control
 
 def place(words: Iterable[str], port: int) -> list[str]:
     return [word.replace("{port}", str(port)) for word in words]
-
-
-def free_port() -> int:
-    """Return a port of 127.0.0.1 on which nothing listens now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -24,9 +24,10 @@ import yaml
 
 from tests.bench import gpu_broker
 from tests.bench.chats import PATIENCE_S, Answer, Load, ask, drive, turns
-from tests.bench.harness import SHIPPED, Suite, arbiter, free_port, p50, p99
+from tests.bench.harness import SHIPPED, Suite, arbiter, p50, p99
 from tests.support.waiting import until
 from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.runtime.ports import free_port
 
 PYTHON = (sys.executable, "-m")
 DOWNLOAD_BYTES = 256 << 20

@@ -18,9 +18,9 @@ from urllib.request import urlopen
 
 import yaml
 
-from tests.bench.harness import free_port
 from tests.support.waiting import until
 from vram_arbiter.schemas.runtime import fakegpu_folder
+from vram_arbiter.schemas.runtime.ports import free_port
 
 VERSION = "0.5.0"
 TOKEN = "of-the-benchmark-alone"

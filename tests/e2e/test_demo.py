@@ -7,7 +7,6 @@ import os
 import pty
 import select
 import shlex
-import socket
 import subprocess
 import sys
 import termios
@@ -17,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from vram_arbiter.schemas.runtime.ports import free_port
 
 pytestmark = [pytest.mark.e2e, pytest.mark.heavy, pytest.mark.timeout(720)]
 
@@ -89,8 +90,7 @@ class Watched:
 
 def test_find_navigate_grab_fits_in_eight_gib(tmp_path: Path) -> None:
     """With the page and `vramctl top` over it, by the lines that the demo prints."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = free_port()
     watched = Watched()
     code, summary = run_demo(tmp_path / "on", "--seed", "0", "--http", str(port), told=watched.line)
     assert b"<title>" in watched.page

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.sidecars.doors.conftest import free_port
 from tests.support.waiting import play
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import load_manifest
+from vram_arbiter.schemas.runtime.ports import free_port
 from vram_arbiter.sidecars.__main__ import main
 from vram_arbiter.sidecars.doors.open import Door, door_of, opened
 
