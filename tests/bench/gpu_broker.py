@@ -18,7 +18,7 @@ from urllib.request import urlopen
 
 import yaml
 
-from tests.bench.harness import free_port
+from tests.support.ports import free_port
 from tests.support.waiting import until
 from vram_arbiter.schemas.runtime import fakegpu_folder
 

@@ -9,7 +9,6 @@ and neighbours move every absolute figure two- to threefold.
 import json
 import math
 import os
-import socket
 import statistics
 import subprocess
 import sys
@@ -338,13 +337,6 @@ class Peer:
 
 
 # -- servers
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        port: int = found.getsockname()[1]
-        return port
-
-
 @contextmanager
 def arbiter(config: str = WIDE, gpu: str = "fake:8GiB") -> Iterator[ArbiterProcess]:
     """A daemon of the run's own with journal, identity checks and measurement as in production. It

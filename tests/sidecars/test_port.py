@@ -11,15 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.ports import free_port
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.sidecars.port import CONNECTIONS_MAX, _pass_on, on_port
 
 BYTES = bytes(range(256)) * 4096  # more than one read
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
 
 
 async def echo(reader, writer):

@@ -2,7 +2,6 @@
 
 import importlib
 import os
-import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import msgpack
 import pytest
 
+from tests.support.ports import free_port
 from tests.support.prepared import start
 from tests.support.process import ArbiterProcess
 from tests.support.waiting import until
@@ -21,12 +21,6 @@ GRAB = "vram-arbiter/so101-grab"
 KEY = "a-key-of-this-test"
 PATIENCE_S = 60.0
 GB = 10**9
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port: int = server.getsockname()[1]
-        return port
 
 
 class Served:

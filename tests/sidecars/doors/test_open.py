@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.sidecars.doors.conftest import free_port
+from tests.support.ports import free_port
 from tests.support.waiting import play
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import load_manifest

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.collector import Collector
+from tests.support.ports import free_port
 from vram_arbiter.schemas.runtime.telemetry.exported import (
     LABEL_MAX_CHARS,
     TEXT_MAX_CHARS,
@@ -15,7 +16,7 @@ from vram_arbiter.schemas.runtime.telemetry.exported import (
     text,
 )
 
-from .test_setup import free_port, needs_sdk, run_program
+from .test_setup import needs_sdk, run_program
 
 HALF = "half a pair: \ud800"
 
@@ -91,7 +92,7 @@ def test_half_a_surrogate_pair_costs_no_other_span_and_no_metric() -> None:
             "OTEL_EXPORTER_OTLP_ENDPOINT": collector.endpoint,
             "OTEL_RESOURCE_ATTRIBUTES": "site=l\udcfcbeck",
             "OTEL_METRICS_EXPORTER": "otlp,prometheus",
-            "OTEL_EXPORTER_PROMETHEUS_PORT": free_port(),
+            "OTEL_EXPORTER_PROMETHEUS_PORT": str(free_port()),
         }
         result = run_program(PROGRAM, environ)
         assert (result.returncode, result.stderr) == (0, "")

@@ -15,6 +15,7 @@ import pytest
 
 from tests.support.collector import Collector
 from tests.support.paths import ROOT
+from tests.support.ports import free_port
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.telemetry import setup
 from vram_arbiter.schemas.runtime.telemetry.setup import Telemetry, wanted
@@ -249,15 +250,9 @@ def test_metrics_leave_every_five_seconds_unless_the_environment_says_another(
         end()
 
 
-def free_port() -> str:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        return str(taken.getsockname()[1])
-
-
 @needs_sdk
 def test_prometheus_is_read_on_loopback_and_not_after_the_end() -> None:
-    port = free_port()
+    port = str(free_port())
     result = run_program(
         "import http.client\n"
         "from vram_arbiter.schemas.runtime.telemetry import names as n\n"
