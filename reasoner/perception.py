@@ -7,7 +7,7 @@ import math
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from time import monotonic
-from typing import Any
+from typing import TypedDict
 
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.base import SidecarClient
@@ -180,7 +180,15 @@ async def need_permitted(sidecar: SidecarClient, palette: Palette | None) -> Non
         raise error
 
 
-def _pictures(clip: Sequence[FrameReply]) -> dict[str, Any]:
+class _Shown(TypedDict, total=False):
+    """A picture, or a video with its rate, as `SceneVlmClient.query` takes them."""
+
+    image_png: bytes
+    video: Sequence[bytes]
+    fps: float
+
+
+def _pictures(clip: Sequence[FrameReply]) -> _Shown:
     """Return one picture as such, several as a video with its rate."""
     images = [frame["data"] for frame in clip]
     if len(images) == 1:

@@ -24,6 +24,7 @@ from vram_arbiter.sidecars.replaced import replaced
 
 if TYPE_CHECKING:
     import torch
+    from bitsandbytes.nn import Linear4bit
     from torch.nn import Module
 
 _log = logging.getLogger(__name__)
@@ -335,7 +336,7 @@ def settle(model: "Module") -> None:
         layer.support_avx512bf16_for_cpu = False
 
 
-def nf4_layers(model: "Module") -> dict[str, Any]:
+def nf4_layers(model: "Module") -> dict[str, "Linear4bit"]:
     """Return the quantized linear layers of a model by name."""
     kind = load_bitsandbytes().nn.Linear4bit
     return {name: layer for name, layer in model.named_modules() if isinstance(layer, kind)}

@@ -128,8 +128,8 @@ class Arbiter:
         gpus = core.gpus.values()
         if any(gpu.dirty for gpu in gpus):  # 3
             grants.schedule(core)
-        if core.turn.unanswered:
-            requests.answer_queued(core)
+        if core.turn.unanswered is not None:
+            requests.answer_queued(core, core.turn.unanswered)
         for gpu in gpus:  # 4
             if gpu.touched:
                 self._keep_reading(gpu)

@@ -133,7 +133,7 @@ def call_back(
     request.wait_timeout_s = wish.wait_timeout_s
     core.requeue(lease, asked.client, asked.id, core.now)
     core.costs.wanted(spec.consumer, core.now)
-    core.turn.unanswered.append(lease)
+    core.turn.unanswered = lease
 
 
 # -- coming back by itself -------------------------------------------------------------------------

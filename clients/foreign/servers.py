@@ -5,12 +5,13 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 from urllib.parse import quote
 
 from vram_arbiter.clients.foreign.actions import Deadline
 from vram_arbiter.clients.foreign.http import OTHER_API, Request, answer, call, call_json
 from vram_arbiter.schemas.errors import ActionFailed
+from vram_arbiter.schemas.plain import JsonMap
 
 LOOK_TIMEOUT_S: Final = 5.0
 """How long a server may take to say whether it works."""
@@ -54,7 +55,7 @@ class Server(ABC):
     def _get(self, path: str) -> Request:
         return Request(self.url + path, "GET")
 
-    def _post(self, path: str, body: Mapping[str, object] | None = None) -> Request:
+    def _post(self, path: str, body: JsonMap | None = None) -> Request:
         return Request(self.url + path, "POST", "" if body is None else json.dumps(body))
 
     def _until_none(
@@ -168,7 +169,7 @@ class LlamaCpp(Server):
         models = self._models(deadline)
         return [model for model, status in models.items() if status not in self.AWAY]
 
-    def _models(self, deadline: Deadline) -> Mapping[str, object]:
+    def _models(self, deadline: Deadline) -> Mapping[str, str]:
         """Return the state of each model. Raises ActionFailed."""
         request = self._get("/models")
         models = _entries(call_json(request, deadline), "data", request)
@@ -177,7 +178,7 @@ class LlamaCpp(Server):
                 f"{request}: models without a status",
                 hint="start llama-server without a model: only its router can unload",
             )
-        return {str(model.get("id")): model["status"].get("value") for model in models}
+        return {str(model.get("id")): str(model["status"].get("value")) for model in models}
 
 
 class ComfyUi(Server):
@@ -206,7 +207,7 @@ SERVERS: Final[Mapping[str, type[Server]]] = {
 }
 
 
-def _entries(found: object, key: str, request: Request) -> Sequence[Mapping[str, Any]]:
+def _entries(found: object, key: str, request: Request) -> Sequence[JsonMap]:
     """Return the list of maps at `key`. Raises ActionFailed."""
     entries = found.get(key) if isinstance(found, dict) else None
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
 from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.client import add_client_flags, client_of, show, show_json
+from vram_arbiter.schemas.plain import Message
 
 
 def add_parser(commands: Commands) -> argparse.ArgumentParser:
@@ -28,7 +28,7 @@ async def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def as_text(answer: dict[str, Any]) -> str:
+def as_text(answer: Message) -> str:
     """Format a state for people, one line per fact."""
     goal = f"{answer['goal']}: {answer['rskill_id']}, {answer['phase']}"
     lines = [

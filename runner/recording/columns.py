@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypedDict
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict
 
 from vram_arbiter.runner.planar import yaw_of
 from vram_arbiter.runner.protocols import GoalTick
@@ -17,6 +17,9 @@ from vram_arbiter.runner.robots.units import LerobotUnits
 from vram_arbiter.runner.sensors.pictures import COLOURS, as_rgb
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.world import Pose, SensorFrame
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 TIMINGS = ("tick", "sensors", "world_state", "inference", "safety", "hal")
 NO_CHUNK = -1  # chunk_index of a tick that was not played from a chunk
@@ -44,6 +47,8 @@ class Feature(TypedDict):
 
 
 Features = dict[str, Feature]
+type LerobotFrame = dict[str, str | NDArray[Any]]
+"""A row as lerobot takes it: texts and arrays by column."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,15 +213,15 @@ def features_of(row: Row) -> Features:
     return features
 
 
-def frame_of(row: Row, features: Features) -> dict[str, Any]:
-    """Return the row as lerobot takes it: arrays and texts by column.
+def frame_of(row: Row, features: Features) -> LerobotFrame:
+    """Return the row as lerobot takes it.
 
     Raises ModelError and FrameStale for a picture without colors, ConfigError for one of another
     size than the first.
     """
     import numpy as np
 
-    made: dict[str, Any] = {"task": row.task}
+    made: LerobotFrame = {"task": row.task}
     for name, one in row.columns.items():
         if name in features:
             text = one.dtype == "string"

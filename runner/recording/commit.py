@@ -16,7 +16,9 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TypedDict
+from typing import Final, TypedDict
+
+from pydantic import TypeAdapter, ValidationError
 
 from vram_arbiter.schemas.errors import AlreadyRunning, BadRequest, BadState, ConfigError
 
@@ -41,23 +43,36 @@ class Record(TypedDict):
     notes_bytes: int
 
 
-class EpisodeNote(TypedDict, total=False):
-    """What is noted of one episode, one line of JSON."""
+class GoalNote(TypedDict, total=False):
+    """A goal, and how it ended."""
 
-    episode: int
-    frames: int
     goal_id: str
     skill: str
-    task: str
-    trace_id: str
-    units: str
     status: str
     code: str
     message: str
     dropped: int
     incomplete: int
-    reasons: dict[str, int]
     marked: str  # by the operator: success or failure
+
+
+class EpisodeNote(GoalNote, total=False):
+    """What is known of an episode before it has a number."""
+
+    frames: int
+    task: str
+    trace_id: str
+    units: str
+    reasons: dict[str, int]
+
+
+class CommittedNote(EpisodeNote):
+    """What is noted of one episode, one line of JSON."""
+
+    episode: int
+
+
+_NOTE: Final = TypeAdapter(CommittedNote)
 
 
 def check_folder(root: Path) -> None:
@@ -110,7 +125,7 @@ def begin(root: Path) -> None:
     _write(root / FOLDER / OPEN, json.dumps(record).encode())
 
 
-def commit(root: Path, episode: EpisodeNote) -> None:
+def commit(root: Path, episode: CommittedNote) -> None:
     """Commit the episode that is open; on disk before this returns."""
     before = opened(root)
     if before is None:
@@ -187,16 +202,27 @@ def repair(root: Path) -> list[str]:
     return said
 
 
-def notes(root: Path) -> list[EpisodeNote]:
-    """Return the notes of the committed episodes, in order, with the operator's marks."""
+def notes(root: Path) -> list[CommittedNote]:
+    """Return the notes of the committed episodes, in order, with the operator's marks.
+
+    Raises ConfigError for a line that is no note.
+    """
     path, record = root / FOLDER / EPISODES, opened(root)
     if not path.exists():
         return []
     text = path.read_bytes()[: None if record is None else record["notes_bytes"]].decode()
-    found: dict[int, EpisodeNote] = {}
-    for line in text.splitlines():
-        note: EpisodeNote = json.loads(line)
-        found[note["episode"]] = {**found.get(note["episode"], {}), **note}
+    found: dict[int, CommittedNote] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        try:
+            note = _NOTE.validate_json(line)
+        except ValidationError as error:
+            wrong = error.errors()[0]
+            where = ".".join(map(str, wrong["loc"])) or "JSON"
+            raise ConfigError(
+                f"{path}, line {number}: {where}: {wrong['msg']}", hint="restore the file"
+            ) from None
+        episode = note["episode"]
+        found[episode] = {**found[episode], **note} if episode in found else note
     return list(found.values())
 
 
@@ -216,7 +242,7 @@ def _files(root: Path) -> list[str]:
     ]
 
 
-def _note(root: Path, note: EpisodeNote) -> None:
+def _note(root: Path, note: CommittedNote) -> None:
     with (root / FOLDER / EPISODES).open("ab") as file:
         file.write(json.dumps(note, ensure_ascii=False).encode() + b"\n")
         file.flush()

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from vram_arbiter.runner.recording import commit
-from vram_arbiter.runner.recording.columns import SUCCESS, Features, differences
+from vram_arbiter.runner.recording.columns import SUCCESS, Features, LerobotFrame, differences
 from vram_arbiter.schemas.errors import ConfigError, InternalError
 
 REPO_ID = "local/recording"  # lerobot wants a name; nothing is ever pushed or pulled
@@ -114,7 +114,7 @@ class LerobotFiles:
         self.rows = 0
         return {name: feature for name, feature in features.items() if name in there}
 
-    def add(self, frame: dict[str, Any]) -> None:
+    def add(self, frame: LerobotFrame) -> None:
         """Add a row. Raises InternalError when the encoder hangs, ValueError for a row that does
         not fit.
         """

@@ -10,7 +10,9 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypedDict, cast
+from typing import Any, Final, TypedDict
+
+from pydantic import TypeAdapter
 
 from vram_arbiter.runner.recording import commit
 from vram_arbiter.runner.recording.columns import (
@@ -28,7 +30,7 @@ from vram_arbiter.schemas.errors import BadRequest, ConfigError
 ParquetRow = dict[str, Any]
 """One row of a table that lerobot wrote, by column."""
 
-OF_GOAL = {"status", "code", "message", "dropped", "incomplete", "marked"}
+_GOAL: Final = TypeAdapter(commit.GoalNote)
 
 
 class Info(TypedDict):
@@ -75,7 +77,7 @@ class Recorded:
     frame_in_episode: int
     at_s: float
     task: str
-    goal: commit.EpisodeNote
+    goal: commit.GoalNote
     trace_id: str
     span_id: str
     trace_sampled: bool
@@ -217,8 +219,6 @@ def _recorded(
         "done": row[DONE],
         "success": row.get(SUCCESS),
     }
-    told = {name: said for name, said in note.items() if name in OF_GOAL}
-    goal = {"goal_id": row["goal_id"], "skill": row["skill"], **told}
     return Recorded(
         root=str(root),
         robot=info.get("robot_type") or "",
@@ -227,7 +227,7 @@ def _recorded(
         frame_in_episode=row["frame_index"],
         at_s=row["timestamp"],
         task=str(note.get("task", "")),
-        goal=cast(commit.EpisodeNote, goal),
+        goal=_GOAL.validate_python({**note, "goal_id": row["goal_id"], "skill": row["skill"]}),
         trace_id=row["trace_id"],
         span_id=row["span_id"],
         trace_sampled=row["trace_sampled"],

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from vram_arbiter.runner.recording.reader import Recorded, RecordedPicture, read_episode
 from vram_arbiter.runner.sensors.pictures import encode
@@ -16,6 +16,9 @@ from vram_arbiter.runner.sensors.ros2_messages import COMPRESSED, stamp_of
 from vram_arbiter.runner.sensors.ros2_types import RosMessage, typestore, write
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.extras import need
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
 
 JOINTS: Final = "sensor_msgs/msg/JointState"
 STATE_TOPIC: Final = "/joint_states"
@@ -34,7 +37,7 @@ def export(root: Path, episode: int, out: Path) -> int:
     rows, count = read_episode(root, episode), 0
     try:
         with Writer(out, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
-            opened: dict[str, Any] = {}
+            opened: dict[str, Connection] = {}
             for stamp_ns, topic, kind, message in _messages(rows):
                 if topic not in opened:
                     opened[topic] = bag.add_connection(topic, kind, typestore=typestore())

@@ -28,6 +28,7 @@ from vram_arbiter.runner.recording.columns import (
     DONE,
     SUCCESS,
     Features,
+    LerobotFrame,
     Row,
     features_of,
     frame_of,
@@ -61,7 +62,7 @@ class EpisodeWriter:
         self._goal: Row | None = None  # first row of the goal that is being recorded
         self._features: Features = {}
         # written when it is known whether it is the episode's last, with the world's verdict
-        self._last: tuple[dict[str, Any], bool | None] | None = None
+        self._last: tuple[LerobotFrame, bool | None] | None = None
         self._broken = 0  # rows of it with a picture that cannot be read
         self._failure: VramError | None = None  # why the goal's rows cannot be recorded
         self._mark = ""  # the operator's verdict on the goal that is being recorded
@@ -124,12 +125,14 @@ class EpisodeWriter:
             self._files.abandon()  # what was not finished
 
     def _close(
-        self, goal: Row, last: dict[str, Any], success: bool | None, note: commit.EpisodeNote
+        self, goal: Row, last: LerobotFrame, success: bool | None, note: commit.EpisodeNote
     ) -> int:
+        import numpy as np
+
         if DONE in last:
-            last[DONE][0] = True
+            last[DONE] = np.array([True])
         if SUCCESS in last:
-            last[SUCCESS][0] = note.get("status") == "succeeded" and success is True
+            last[SUCCESS] = np.array([note.get("status") == "succeeded" and success is True])
         self._files.add(last)
         about: commit.EpisodeNote = {
             "goal_id": goal.goal_id,

@@ -125,8 +125,9 @@ def _model_twin(config: HalConfig, clock: Clock | None) -> HalBase:
         params.rest_pose_rad,
         simulated=True,
         base=None if base is None else MobileBase(**base.model_dump(), tells_twist=True),
-        **_modelled(params, names, bare.model),
+        units=PolicyUnits(**params.units.model_dump()),
     )
+    description = _modelled(description, params, bare.model)
     _has_actuators(model, description)
     from vram_arbiter.runner.robots.mujoco_twin import MujocoTwin
 
@@ -160,8 +161,9 @@ def _loaded(description: RobotDescription) -> Any:
         raise wrong(("params", "model"), f"{error.message}{hint}") from error
 
 
-def _modelled(params: ModelParams, joints: tuple[str, ...], model: str) -> dict[str, Any]:
-    """Return the fields of a description that come from the model's parameters."""
+def _modelled(robot: RobotDescription, params: ModelParams, model: str) -> RobotDescription:
+    """Return the description with the fields that come from the model's parameters."""
+    joints = robot.joint_names
     for name, end in params.ends.items():
         if end.gripper is not None and end.gripper not in joints:
             raise wrong(
@@ -171,9 +173,8 @@ def _modelled(params: ModelParams, joints: tuple[str, ...], model: str) -> dict[
     if params.ends and not model:
         raise wrong(("params", "model"), "give the MJCF file that has the ends' frames")
     ends = tuple(EndEffector(name, end.frame, end.gripper) for name, end in params.ends.items())
-    known = RobotDescription("", (), {}, model=model)
     if model:
-        frames = frames_of(_loaded(known))
+        frames = frames_of(_loaded(RobotDescription("", (), {}, model=model)))
         for path, frame in (
             *((("ends", name, "frame"), end.frame) for name, end in params.ends.items()),
             *((("frames", name), frame) for name, frame in params.frames.items()),
@@ -183,12 +184,7 @@ def _modelled(params: ModelParams, joints: tuple[str, ...], model: str) -> dict[
                     ("params", *path),
                     f"the model has no frame {frame!r}{did_you_mean(frame, frames)}",
                 )
-    return {
-        "model": model,
-        "ends": ends,
-        "frames": params.frames,
-        "units": PolicyUnits(**params.units.model_dump()),
-    }
+    return dataclasses.replace(robot, model=model, ends=ends, frames=params.frames)
 
 
 def _is_slide(joint: Any) -> bool:
@@ -237,15 +233,16 @@ def _lerobot(config: HalConfig, clock: Clock | None) -> HalBase:
     if problems:
         raise config_error(SOURCE, problems)
     rest = {**(known.rest_pose_rad if known else {}), **params.rest_pose_rad}
-    given: dict[str, Any] = {}
-    if known is not None:
-        given = {"model": known.model, "ends": known.ends}
-    if params.model or params.ends or params.frames:
-        given = _modelled(params, names, _file(params))
-    given["units"] = PolicyUnits(**params.units.model_dump())
     description = RobotDescription(
-        known.name if known else config.adapter, tuple(joints), rest, **given
+        known.name if known else config.adapter,
+        tuple(joints),
+        rest,
+        model=known.model if known else "",
+        ends=known.ends if known else (),
+        units=PolicyUnits(**params.units.model_dump()),
     )
+    if params.model or params.ends or params.frames:
+        description = _modelled(description, params, _file(params))
     return LerobotHal(robot, description, scales, estop=params.estop, clock=clock)
 
 

@@ -12,7 +12,7 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from vram_arbiter.runner.control.clock import Clock, SystemClock
 from vram_arbiter.runner.protocols import RobotDescription
@@ -20,6 +20,9 @@ from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.units import POSITION, LerobotUnits, Scale
 from vram_arbiter.schemas.errors import RobotFault
 from vram_arbiter.schemas.world import JointState
+
+if TYPE_CHECKING:
+    from lerobot.lerobot_types import RobotAction, RobotObservation
 
 log = logging.getLogger(__name__)
 
@@ -107,7 +110,7 @@ class LerobotHal(HalBase):
         wanted = {**self._target, **targets}
         command = {name + POSITION: self._scales[name].of(value) for name, value in wanted.items()}
         with self._faults("move"):
-            sent: Mapping[str, Any] = self._robot.send_action(command)
+            sent: RobotAction = self._robot.send_action(command)
         # lerobot answers with what it really sent (`max_relative_target` shortens steps): joints
         # that later actions leave out stay there
         for name in wanted:
@@ -129,7 +132,7 @@ class LerobotHal(HalBase):
 
     def _positions(self) -> dict[str, float]:
         with self._faults("answer"):
-            seen: Mapping[str, Any] = self._robot.get_observation()
+            seen: RobotObservation = self._robot.get_observation()
         if missing := [name for name in self._scales if name + POSITION not in seen]:
             raise RobotFault(f"{self.description.name} does not report {', '.join(missing)}")
         return {

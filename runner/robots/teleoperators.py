@@ -12,7 +12,7 @@ import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.runner.control.clock import Clock, SystemClock
 from vram_arbiter.runner.protocols import RobotDescription
@@ -22,6 +22,9 @@ from vram_arbiter.runner.robots.units import POSITION, JointUnit, LerobotUnits, 
 from vram_arbiter.schemas.config.robot import TeleopConfig
 from vram_arbiter.schemas.errors import RobotFault, StateStale
 from vram_arbiter.schemas.findings import did_you_mean
+
+if TYPE_CHECKING:
+    from lerobot.lerobot_types import RobotAction
 
 MAX_AGE_S = 0.2  # as of a joint state: an older pose is not the operator's any more
 KEYBOARD = "keyboard"
@@ -87,7 +90,7 @@ class Teleoperator(ABC):
     def _connect(self) -> None: ...
 
     @abstractmethod
-    def _pose_of(self, action: Mapping[str, Any]) -> Pose:
+    def _pose_of(self, action: RobotAction) -> Pose:
         """Return the pose that an action of the device means."""
 
     def _disconnect(self) -> None:
@@ -141,7 +144,7 @@ class Leader(Teleoperator):
                 f" --teleop.id={self._device.id} once, and give the same id in teleop.transport",
             )
 
-    def _pose_of(self, action: Mapping[str, Any]) -> Pose:
+    def _pose_of(self, action: RobotAction) -> Pose:
         pose = {
             name: scale.joint(float(action[name + POSITION]))
             for name, scale in self._scales.items()
@@ -169,7 +172,7 @@ class Keyboard(Teleoperator):
         if not self._device.is_connected:
             raise RobotFault("no keys can be read here", hint="lerobot's keyboard needs X11")
 
-    def _pose_of(self, action: Mapping[str, Any]) -> Pose:
+    def _pose_of(self, action: RobotAction) -> Pose:
         return dict(self._ends[key] for key in action if key in self._ends)
 
 

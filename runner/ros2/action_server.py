@@ -12,7 +12,7 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Final, Protocol, Self
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self
 
 from vram_arbiter.runner.ros2.service_client import action_services
 from vram_arbiter.runner.sensors.dds_thread import DdsThread
@@ -27,6 +27,10 @@ from vram_arbiter.runner.sensors.ros2_dds import (
 from vram_arbiter.runner.sensors.ros2_types import action_of, cdr_of, read, sample_of, write
 from vram_arbiter.schemas.errors import ConfigError, VramError
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
+
+if TYPE_CHECKING:
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.sub import DataReader
 
 log = logging.getLogger(__name__)
 
@@ -107,8 +111,8 @@ class ActionServer:
         self._closing = False
         self._tasks: set[asyncio.Task[None]] = set()
         self._running: set[asyncio.Task[None]] = set()
-        self._readers: dict[str, Any] = {}
-        self._writers: dict[str, Any] = {}
+        self._readers: dict[str, DataReader] = {}
+        self._writers: dict[str, DataWriter] = {}
         self._node: Any = None  # what tells of it
         self.failed: asyncio.Future[str]
 

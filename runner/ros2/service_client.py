@@ -12,13 +12,17 @@ import asyncio
 import logging
 import secrets
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import TYPE_CHECKING, Self
 
 from vram_arbiter.runner.sensors.dds_thread import DdsThread
 from vram_arbiter.runner.sensors.ros2_dds import dds_problems, full_topic, reader_of, writer_of
 from vram_arbiter.runner.sensors.ros2_types import action_of, cdr_of, read, sample_of, write
 from vram_arbiter.schemas.errors import ConfigError, SidecarUnavailable
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
+
+if TYPE_CHECKING:
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.sub import DataReader
 
 log = logging.getLogger(__name__)
 
@@ -51,8 +55,8 @@ class ServiceClient:
         self._guid = secrets.randbits(63)
         self._sent = 0
         self._waiting: dict[tuple[str, int], asyncio.Future[JsonObject]] = {}
-        self._writers: dict[str, Any] = {}
-        self._readers: dict[str, Any] = {}
+        self._writers: dict[str, DataWriter] = {}
+        self._readers: dict[str, DataReader] = {}
         self._served = asyncio.Event()
 
     async def __aenter__(self) -> Self:

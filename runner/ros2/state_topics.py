@@ -11,7 +11,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.sensors.ros2_dds import announce, dds_problems, dds_topic, writer_of
@@ -22,6 +22,9 @@ from vram_arbiter.runner.skills import rotations
 from vram_arbiter.schemas.errors import FrameStale, VramError
 from vram_arbiter.schemas.manifest.vocabulary import Rotation
 from vram_arbiter.schemas.plain import Message
+
+if TYPE_CHECKING:
+    from cyclonedds.pub import DataWriter
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +52,7 @@ class StateTopics:
         self._silent = False
         with dds_problems(domain):
             participant = DomainParticipant(domain)
-            self._writers: dict[str, Any] = {
+            self._writers: dict[str, DataWriter] = {
                 name: writer_of(
                     participant, dds_topic(name), kind, kept=KEPT, latched=name == "/tf_static"
                 )

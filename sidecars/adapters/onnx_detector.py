@@ -8,7 +8,7 @@ from transformers), or `labels`, `boxes` and `scores` (RT-DETR's own exporter).
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from vram_arbiter.schemas.errors import BadRequest, ConfigError, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest
@@ -20,6 +20,9 @@ from vram_arbiter.sidecars.adapters.base import ModelCall
 from vram_arbiter.sidecars.adapters.detector import detected, detection, split_query
 from vram_arbiter.sidecars.images import decode
 from vram_arbiter.sidecars.weights import ONNX_FILES, Weights, fetched, fitting
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 CPU: Final = "CPUExecutionProvider"
 CUDA: Final = "CUDAExecutionProvider"
@@ -40,7 +43,8 @@ SIZES: Final = "orig_target_sizes"
 
 type Provider = tuple[str, dict[str, str]]
 """Name and options."""
-type Outputs = Mapping[str, Any]
+type Outputs = Mapping[str, NDArray[Any]]
+"""Arrays by the names of the outputs."""
 type Found = tuple[Any, Any]
 """Scores (boxes, classes) and boxes (boxes, 4: x0, y0, x1, y1 in pixels of the whole picture)."""
 

@@ -33,7 +33,7 @@ def run(suite: Suite) -> None:
     live_leases(suite)
     waiters_memory(suite)
     disconnects(suite)
-    flood(suite)
+    under_a_flood(suite)
 
 
 def live_leases(suite: Suite) -> None:
@@ -142,7 +142,7 @@ def all_forgotten(witness: Peer) -> bool:
     return True
 
 
-def flood(suite: Suite) -> None:
+def under_a_flood(suite: Suite) -> None:
     """A client's acquire + release while another sends as fast as its socket takes it. Limits as
     shipped."""
     rounds = suite.size(1500, 150)

@@ -59,13 +59,13 @@ async def drive(url: str, models: Sequence[str], load: Load) -> list[Answer]:
             pauses = random.Random(number)
             while time.monotonic() < until:
                 await asyncio.sleep(pauses.expovariate(1 / load.pause_s) if load.pause_s else 0)
-                answers.append(await ask(session, url, model, load.tokens))
+                answers.append(await timed_chat(session, url, model, load.tokens))
 
         await asyncio.gather(*(chat(name, number) for number, name in enumerate(names)))
     return answers
 
 
-async def ask(session: aiohttp.ClientSession, url: str, model: str, tokens: int) -> Answer:
+async def timed_chat(session: aiohttp.ClientSession, url: str, model: str, tokens: int) -> Answer:
     """Ask once and read to the end."""
     asked_at = first_at = time.monotonic()
     size, problem, ending = 0, "", b""

@@ -23,7 +23,7 @@ import aiohttp
 import yaml
 
 from tests.bench import gpu_broker
-from tests.bench.chats import PATIENCE_S, Answer, Load, ask, drive, turns
+from tests.bench.chats import PATIENCE_S, Answer, Load, drive, timed_chat, turns
 from tests.bench.harness import SHIPPED, Suite, arbiter, p50, p99
 from tests.support.waiting import until
 from vram_arbiter.schemas import fakegpu
@@ -166,7 +166,7 @@ def _chat(url: str) -> float:
 
     async def read() -> Answer:
         async with aiohttp.ClientSession(timeout=aiohttp.ClientTimeout(PATIENCE_S)) as session:
-            return await ask(session, url, "chat", CHAT_TOKENS)
+            return await timed_chat(session, url, "chat", CHAT_TOKENS)
 
     (one,) = _whole([asyncio.run(read())])
     return one.size_bytes / (one.ended_at - one.asked_at)

@@ -337,8 +337,6 @@ class Peer:
 
 
 # -- servers
-
-
 @contextmanager
 def arbiter(config: str = WIDE, gpu: str = "fake:8GiB") -> Iterator[ArbiterProcess]:
     """A daemon of the run's own with journal, identity checks and measurement as in production. It

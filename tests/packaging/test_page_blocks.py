@@ -212,7 +212,7 @@ def test_python_compiles_and_imports_what_exists(block: Block) -> None:
             assert [name.name for name in node.names if not hasattr(module, name.name)] == []
 
 
-def robot(**parts: object) -> None:
+def robot_of_block(**parts: object) -> None:
     whole = {"robot_id": "page", "hal": {"adapter": "so101_mujoco"}, **parts}
     load_robot(yaml.safe_dump(whole), "page")
 
@@ -226,8 +226,8 @@ KINDS: Mapping[frozenset[str], Callable[[str], object]] = {
     frozenset({"schema_version"}): parse_manifest,
     frozenset({"policy_extras"}): lambda text: skill_of_block(**yaml.safe_load(text)),
     frozenset({"robot_id"}): lambda text: load_robot(text, "page"),
-    frozenset({"sensors"}): lambda text: robot(**yaml.safe_load(text)),
-    frozenset({"model", "ends"}): lambda text: robot(
+    frozenset({"sensors"}): lambda text: robot_of_block(**yaml.safe_load(text)),
+    frozenset({"model", "ends"}): lambda text: robot_of_block(
         hal={"adapter": "mujoco", "params": yaml.safe_load(text)}
     ),
     frozenset({"hooks"}): lambda text: load_observer(text, "page"),

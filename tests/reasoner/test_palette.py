@@ -49,7 +49,7 @@ BY_KIND = {
 }
 
 
-def manifest_of(
+def manifest_of_kind(
     kind: str, *, name: str = "", role: str = "", license: str = "mit"
 ) -> RSkillManifest:
     role = role or ("s2" if kind == "playbook" else "s1")
@@ -72,7 +72,7 @@ def palette(
 @pytest.mark.parametrize("kind", [str(kind) for kind in Kind])
 def test_the_kind_decides_whether_a_skill_is_executed(kind: str) -> None:
     """The defect of the field: a vlm with role s1 came into the executable palette."""
-    found = palette(manifest_of(kind))
+    found = palette(manifest_of_kind(kind))
     error = found.check(ExecuteRskill(rskill_id=f"lab/{kind}"))
     offered = {function["function"]["name"] for function in found.functions()}
     if kind in EXECUTABLE_KINDS:
@@ -97,7 +97,7 @@ def test_only_three_kinds_move_anything() -> None:
     ("can_locate", "can_query"), [(False, False), (False, True), (True, False), (True, True)]
 )
 def test_looking_and_asking_are_independent(can_locate: bool, can_query: bool) -> None:
-    found = palette(manifest_of("vla"), can_locate=can_locate, can_query=can_query)
+    found = palette(manifest_of_kind("vla"), can_locate=can_locate, can_query=can_query)
     offered = {function["function"]["name"] for function in found.functions()}
     assert (
         ("locate_in_view" in offered)
@@ -124,7 +124,7 @@ def test_looking_and_asking_are_independent(can_locate: bool, can_query: bool) -
     ],
 )
 def test_a_licence_that_forbids_commercial_use_bars_a_skill(license: str, commercial: bool) -> None:
-    skill, eye = manifest_of("vla", license=license), manifest_of("vlm", license=license)
+    skill, eye = manifest_of_kind("vla", license=license), manifest_of_kind("vlm", license=license)
     gated, open_ = palette(skill, eye), palette(skill, eye, allow_noncommercial=True)
     call = ExecuteRskill(rskill_id="lab/vla")
     assert (gated.check(call) is None) == commercial
@@ -142,7 +142,7 @@ def test_a_licence_that_forbids_commercial_use_bars_a_skill(license: str, commer
 
 def test_a_skill_without_weights_has_no_licence_of_weights() -> None:
     assert (
-        palette(manifest_of("ros_action", license="unknown")).check(
+        palette(manifest_of_kind("ros_action", license="unknown")).check(
             ExecuteRskill(rskill_id="lab/ros_action")
         )
         is None
@@ -169,7 +169,7 @@ def test_a_skill_for_another_robot_is_not_offered() -> None:
 
 
 def test_a_model_for_another_robot_is_not_asked_either() -> None:
-    eye = manifest_of("vlm")
+    eye = manifest_of_kind("vlm")
     other = eye.model_copy(update={"embodiment_tags": ("go2",)})
     assert palette(eye, body=ARM).permits("lab/vlm") is None
     assert "made for go2" in str(palette(other, body=ARM).permits("lab/vlm"))
@@ -181,15 +181,15 @@ def skill_for(tag: str, *, name: str, needs: str = "{}") -> RSkillManifest:
 
 
 def test_a_template_is_never_executed() -> None:
-    found = palette(manifest_of("vla", name="TEMPLATE_ORG/x"), allow_noncommercial=True)
+    found = palette(manifest_of_kind("vla", name="TEMPLATE_ORG/x"), allow_noncommercial=True)
     assert "template" in str(found.check(ExecuteRskill(rskill_id="TEMPLATE_ORG/x")))
 
 
 def test_lifecycle_only_for_nodes_on_the_list() -> None:
     """The defect of the field: any node could be switched, the safety kernel too."""
     nobody, some = (
-        palette(manifest_of("vla")),
-        palette(manifest_of("vla"), managed=frozenset({"detector"})),
+        palette(manifest_of_kind("vla")),
+        palette(manifest_of_kind("vla"), managed=frozenset({"detector"})),
     )
     call = LifecycleTransition(node="detector", transition="activate")
     assert isinstance(nobody.check(call), NotPermitted)
@@ -204,13 +204,13 @@ def test_lifecycle_only_for_nodes_on_the_list() -> None:
 
 
 def test_prompts_go_only_where_somebody_listens() -> None:
-    found = palette(manifest_of("vla"), topics=frozenset({OPERATOR}))
+    found = palette(manifest_of_kind("vla"), topics=frozenset({OPERATOR}))
     assert found.check(EmitPrompt(target_topic="/operator", text="hello")) is None
     assert isinstance(found.check(EmitPrompt(target_topic="/cmd_vel", text="go")), NotPermitted)
 
 
 def test_beside_a_goal_only_its_going_on_is_allowed() -> None:
-    found = palette(manifest_of("vla"), managed=frozenset({"detector"}))
+    found = palette(manifest_of_kind("vla"), managed=frozenset({"detector"}))
     for call in (ExecuteRskill(rskill_id="lab/vla"), LocateInView(query="x"),
     QueryScene(question="x"),
                  LifecycleTransition(node="detector", transition="deactivate")):  # fmt: skip
@@ -226,7 +226,9 @@ def test_a_refusal_names_what_is_offered_and_nothing_else() -> None:
     tool that was not there.
     """
     found = palette(
-        manifest_of("ros_action", name="lab/go"), manifest_of("detector"), can_locate=False
+        manifest_of_kind("ros_action", name="lab/go"),
+        manifest_of_kind("detector"),
+        can_locate=False,
     )
     offered = "choose from execute_rskill__lab__go, finish, query_scene"
     for call, goal_runs, hint in (
@@ -300,7 +302,7 @@ def test_a_broken_schema_never_breaks_the_check(schema: dict[str, Any], value: A
 
 def test_names_under_which_a_skill_is_called() -> None:
     found = palette(
-        manifest_of("vla", name="lab/skill.v2"), manifest_of("vla", name="lab/skill_v2")
+        manifest_of_kind("vla", name="lab/skill.v2"), manifest_of_kind("vla", name="lab/skill_v2")
     )
     first, second = (f["function"]["name"] for f in found.functions()[:2])
     assert first != second
@@ -318,8 +320,8 @@ def test_a_skill_that_describes_no_parameters_takes_none() -> None:
 
 def test_only_role_s1_is_offered_as_an_action() -> None:
     """Regression: a skill of role s2 was offered as an action."""
-    slow = manifest_of("vla", name="lab/slow", role="s2")
-    found = palette(slow, manifest_of("vla"))
+    slow = manifest_of_kind("vla", name="lab/slow", role="s2")
+    found = palette(slow, manifest_of_kind("vla"))
     assert list(found.executable) == ["lab/vla"]
     error = found.check(ExecuteRskill(rskill_id="lab/slow"))
     assert isinstance(error, NotPermitted)
@@ -328,7 +330,7 @@ def test_only_role_s1_is_offered_as_an_action() -> None:
 
 def test_the_order_of_the_palette_is_that_of_the_names() -> None:
     """The same prompt for the same skills, in whatever order their folders were read."""
-    skills = [manifest_of("vla", name=f"lab/{letter}") for letter in "cab"]
+    skills = [manifest_of_kind("vla", name=f"lab/{letter}") for letter in "cab"]
     offered = [function["function"]["name"] for function in palette(*skills).functions()]
     assert offered[:3] == [f"execute_rskill__lab__{letter}" for letter in "abc"]
     assert palette(*skills) == palette(*reversed(skills))

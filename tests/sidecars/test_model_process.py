@@ -97,12 +97,12 @@ def no_log() -> None:
     """Leave the log as it is."""
 
 
-def detect(query: str) -> dict[str, object]:
+def detect_op(query: str) -> dict[str, object]:
     return {"op": "detect", "image": PNG, "query": query}
 
 
-async def ask(model, query: str, begin_s: float = WAIT_S, end_s: float = WAIT_S):
-    reply = await model.run(detect(query), begin_s=begin_s, end_s=end_s, begins=lambda: None)
+async def answer_of(model, query: str, begin_s: float = WAIT_S, end_s: float = WAIT_S):
+    reply = await model.run(detect_op(query), begin_s=begin_s, end_s=end_s, begins=lambda: None)
     return reply["answer"]
 
 
@@ -116,7 +116,7 @@ async def test_its_end_returns_every_byte(place: Place) -> None:
         model = await place.start()
         assert place.used() == 0, "a process has nothing on the GPU before its load"
         assert await model.load("") == GB
-        assert (await ask(model, "cube"))["answer"] == "cube"
+        assert (await answer_of(model, "cube"))["answer"] == "cube"
         await model.end()
         await model.end()
         assert model.ended.is_set()
@@ -132,10 +132,10 @@ async def test_errors_keep_their_type(place: Place) -> None:
         model = await place.start()
         await model.load("")
         with pytest.raises(ModelError, match="RuntimeError: the model fails as told"):
-            await ask(model, "fail")
+            await answer_of(model, "fail")
         with pytest.raises(BadRequest, match="not like that"):
-            await ask(model, "refuse")
-        assert (await ask(model, "cube"))["answer"] == "cube", "it lives on"
+            await answer_of(model, "refuse")
+        assert (await answer_of(model, "cube"))["answer"] == "cube", "it lives on"
         await model.end()
 
 
@@ -145,18 +145,18 @@ async def test_a_request_that_could_not_begin_in_time_never_does(place: Place) -
     async with asyncio.timeout(WAIT_S):
         model = await place.start()
         await model.load("")
-        hanging = asyncio.create_task(ask(model, "hold go"))
+        hanging = asyncio.create_task(answer_of(model, "hold go"))
         await holding(place)
         with pytest.raises(WaitTimeout, match="busy"):
-            await ask(model, "late", begin_s=0.05)
-        canceled = asyncio.create_task(ask(model, "x"))
+            await answer_of(model, "late", begin_s=0.05)
+        canceled = asyncio.create_task(answer_of(model, "x"))
         await asyncio.sleep(0)
         canceled.cancel()
         with pytest.raises(asyncio.CancelledError):
             await canceled
         (place.folder / "go").touch()
         assert (await hanging)["answer"] == "hold go"
-        assert (await ask(model, "next"))["answer"] == "next"
+        assert (await answer_of(model, "next"))["answer"] == "next"
         await model.end()
 
 
@@ -165,10 +165,10 @@ async def test_a_request_that_does_not_end_is_ended_with_its_process(place: Plac
         model = await place.start()
         await model.load("")
         with pytest.raises(ModelError, match="has not answered within"):
-            await ask(model, "hold for ever", end_s=0.2)
+            await answer_of(model, "hold for ever", end_s=0.2)
         await model.ended.wait()
         with pytest.raises(ModelError, match="ended by SIGKILL"):
-            await ask(model, "next")
+            await answer_of(model, "next")
     until(lambda: place.used() == 0)
 
 
@@ -177,14 +177,14 @@ async def test_a_caller_that_turns_away_leaves_the_model_in_order(place: Place) 
     async with asyncio.timeout(WAIT_S):
         model = await place.start()
         await model.load("")
-        turning_away = asyncio.create_task(ask(model, "hold go"))
+        turning_away = asyncio.create_task(answer_of(model, "hold go"))
         await holding(place)
         turning_away.cancel()
         await asyncio.sleep(0)
         (place.folder / "go").touch()
         with pytest.raises(asyncio.CancelledError):
             await turning_away
-        assert (await ask(model, "next"))["answer"] == "next"
+        assert (await answer_of(model, "next"))["answer"] == "next"
         await model.end()
 
 
@@ -239,7 +239,7 @@ async def test_the_keeper_has_one_thread_and_no_device_before_each_fork(
         for _ in range(2):
             model = await processes.start()
             await model.load("")
-            answers.append(await ask(model, "sum"))
+            answers.append(await answer_of(model, "sum"))
             keeper = parent(model.pid)
             threads = os.listdir(f"/proc/{keeper}/task")
             opened = [os.readlink(one) for one in Path(f"/proc/{keeper}/fd").iterdir()]

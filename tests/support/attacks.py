@@ -35,7 +35,7 @@ def peer_greeting(socket_type: bytes = b"DEALER", identity: bytes = b"") -> byte
     return GREETING + b"\x06" + len(body).to_bytes(8) + body
 
 
-def connect(path: str, first: bytes | None = None) -> socket.socket:
+def raw_connection(path: str, first: bytes | None = None) -> socket.socket:
     """A connection that has said `first` (greeting and READY unless given). Raises OSError."""
     peer = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
@@ -50,7 +50,7 @@ def connect(path: str, first: bytes | None = None) -> socket.socket:
 
 def shaken(path: str) -> socket.socket:
     """A connection whose handshake is complete. Raises OSError where the server hangs up."""
-    peer = connect(path)
+    peer = raw_connection(path)
     left = len(GREETING) + len(READY)
     while left:
         if not (data := peer.recv(left)):
@@ -126,7 +126,7 @@ def half_messages(path: str, end_s: float) -> None:
 
 def bare_connects(path: str, end_s: float) -> None:
     """Connections that never say anything."""
-    _hoard(path, end_s, lambda path: connect(path, b""))
+    _hoard(path, end_s, lambda path: raw_connection(path, b""))
 
 
 def silent_peers(path: str, end_s: float) -> None:
@@ -136,7 +136,7 @@ def silent_peers(path: str, end_s: float) -> None:
 
 def forged_identity(path: str, end_s: float) -> None:
     """Connections under the identity that libzmq would give to the next one."""
-    _hoard(path, end_s, lambda path: connect(path, peer_greeting(identity=_IDENTITY)))
+    _hoard(path, end_s, lambda path: raw_connection(path, peer_greeting(identity=_IDENTITY)))
 
 
 def unknown_keys(path: str, end_s: float) -> None:

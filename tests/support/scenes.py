@@ -62,6 +62,11 @@ def place(driver: CoreDriver, lease: LeaseId) -> str | None:
     return gpu
 
 
+def verdicts(driver: CoreDriver) -> list[tuple[str, bool]]:
+    """Return the verdicts so far, each with whether it freed the charge."""
+    return [(note["verdict"], note["resolved"]) for note in driver.notes("verified")]
+
+
 def why(driver: CoreDriver, consumer: str) -> dict[str, Any]:
     """What `why` says of a consumer with one lease."""
     found: dict[str, Any]

@@ -180,8 +180,8 @@ class Turn:
 
     effects: list[Effect] = field(default_factory=list)
     """To be performed, in this order."""
-    unanswered: list[Lease] = field(default_factory=list)
-    """Leases of this event's acquire; one that is not granted at once is answered `queued`."""
+    unanswered: Lease | None = None
+    """The lease of this event's acquire; it is answered `queued` unless it is granted at once."""
     granted: list[tuple[Token, GpuId]] = field(default_factory=list)
     """Grants, for the invariants."""
     taken_back: dict[LeaseId, Eviction] = field(default_factory=dict)

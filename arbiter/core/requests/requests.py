@@ -178,7 +178,7 @@ def _new_lease(
     core.nonces[client.process, wanted.nonce] = lease.id
     if spec.consumer in core.costs.reuse:
         core.costs.wanted(spec.consumer, core.now)
-    core.turn.unanswered.append(lease)
+    core.turn.unanswered = lease
     return lease
 
 
@@ -201,19 +201,18 @@ def reacquire(core: Core, asked: ev.Asked, request: w.Reacquire) -> None:
     core.reply(asked.client, asked.id, AcquireReply("queued", status.view(core, lease)))
 
 
-def answer_queued(core: Core) -> None:
-    """Tell requests of this event that the scheduling did not grant that they wait, and why."""
-    for lease in core.turn.unanswered:
-        request = lease.request
-        if lease.state is not LeaseState.QUEUED or request.answered or request.id is None:
-            continue
-        request.answered = True
-        view = status.view(core, lease)
-        ahead = ahead_of(core.gpus, lease) if view.position and view.position > 1 else ""
-        gpu = core.gpus[request.planned_gpu or request.gpus[0]]
-        block = None if ahead else status.block_view(core, gpu)
-        core.note(QueuedNote(view.position, request.reason, ahead, block), lease)
-        core.reply(lease.client, request.id, AcquireReply("queued", view))
+def answer_queued(core: Core, lease: Lease) -> None:
+    """Tell an acquire of this event that the scheduling did not grant that it waits, and why."""
+    request = lease.request
+    if lease.state is not LeaseState.QUEUED or request.answered or request.id is None:
+        return
+    request.answered = True
+    view = status.view(core, lease)
+    ahead = ahead_of(core.gpus, lease) if view.position and view.position > 1 else ""
+    gpu = core.gpus[request.planned_gpu or request.gpus[0]]
+    block = None if ahead else status.block_view(core, gpu)
+    core.note(QueuedNote(view.position, request.reason, ahead, block), lease)
+    core.reply(lease.client, request.id, AcquireReply("queued", view))
 
 
 def cancel(core: Core, asked: ev.Asked, request: w.Cancel) -> None:

@@ -10,12 +10,13 @@ from lerobot.processor import (
     PolicyProcessorPipeline,
     make_default_pre_post_processors,
 )
+from torch import Tensor
 
 from vram_arbiter.sidecars.models.compact_act.configuration_compact_act import CompactActConfig
 
 
 def make_compact_act_pre_post_processors(
-    config: CompactActConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
+    config: CompactActConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],

@@ -58,12 +58,12 @@ class WordsStep(ProcessorStep):  # type: ignore[misc]
     def transform_features(self, features: Any) -> Any:
         return features
 
-    def get_config(self) -> dict[str, Any]:
+    def get_config(self) -> dict[str, list[str]]:
         return {"colours": self.colours, "shapes": self.shapes}
 
 
 def make_compact_progress_pre_post_processors(
-    config: CompactProgressConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
+    config: CompactProgressConfig, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],

@@ -23,7 +23,7 @@ RANDOM = st.randoms(use_true_random=False)
 SETTINGS = settings(deadline=None, suppress_health_check=list(HealthCheck))
 
 
-def outcome(frame: bytes) -> str:
+def code_of(frame: bytes) -> str:
     """`ok`, or the code of the error; anything else that is raised fails the test."""
     try:
         codec.decode(frame, MESSAGE_MAX_BYTES)
@@ -37,13 +37,13 @@ def outcome(frame: bytes) -> str:
 @SETTINGS
 @given(RANDOM, st.sampled_from(sorted(REQUESTS)))
 def test_the_forger_knows_every_op_of_the_wire(draw: random.Random, op: str) -> None:
-    assert outcome(pack(Forger(draw).request(op))) == "ok"
+    assert code_of(pack(Forger(draw).request(op))) == "ok"
 
 
 @SETTINGS
 @given(RANDOM)
 def test_a_frame_of_any_kind_is_a_request_or_a_typed_error(draw: random.Random) -> None:
-    assert outcome(Forger(draw).frame()) in (
+    assert code_of(Forger(draw).frame()) in (
         "ok", "bad_frame", "bad_request", "unknown_op", "message_too_large"
     )  # fmt: skip
 
@@ -75,7 +75,7 @@ def test_a_bomb_is_defused_in_little_memory(name: str) -> None:
     )  # whatever is made once is made now
     tracemalloc.start()
     try:
-        found = outcome(frame)
+        found = code_of(frame)
         _, peak_bytes = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

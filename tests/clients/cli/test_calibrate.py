@@ -217,20 +217,20 @@ def fake_folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def seen(tmp_path: Path) -> Path:
+def readings(tmp_path: Path) -> Path:
     (tmp_path / "seen").mkdir()
     return tmp_path / "seen"
 
 
 @pytest.fixture
-def gpu(fake_folder: Path, seen: Path) -> Gpu:
+def gpu(fake_folder: Path, readings: Path) -> Gpu:
     """A simulated GPU that tells a program in a folder which sizes, in MiB, were read."""
     plain = fake_gpu(fake_folder)
 
     def read() -> Reading:
         reading = plain.read()
         for count in (*(reading.processes or {}).values(), reading.used_bytes):
-            (seen / str(count // MIB)).touch()
+            (readings / str(count // MIB)).touch()
         return reading
 
     return replace(plain, read=read)
@@ -254,12 +254,14 @@ def hide(fake_folder: Path) -> None:
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("listed", [True, False], ids=["listed", "hidden"])
-def test_a_program_under_observation(listed: bool, gpu: Gpu, seen: Path, fake_folder: Path) -> None:
+def test_a_program_under_observation(
+    listed: bool, gpu: Gpu, readings: Path, fake_folder: Path
+) -> None:
     """Its bytes are those of its tree, also when a parent in it has ended."""
     if not listed:
         hide(fake_folder)
     record = Record(gpu, RATE_HZ)
-    assert recorded(record, sys.executable, "-c", ADOPTED, PROGRAM, str(seen)) == 0
+    assert recorded(record, sys.executable, "-c", ADOPTED, PROGRAM, str(readings)) == 0
     assert record.listed is listed
     assert record.figures({}) == Figures(load_peak=1500 * MIB, steady=1000 * MIB)
 
@@ -294,19 +296,19 @@ detector: {labels: [cube]}
 
 @pytest.mark.e2e
 @pytest.mark.heavy
-def test_a_model_in_a_sidecar_of_its_own(gpu: Gpu, seen: Path, fake_folder: Path) -> None:
+def test_a_model_in_a_sidecar_of_its_own(gpu: Gpu, readings: Path, fake_folder: Path) -> None:
     """Its load peak is seen although it is freed at once: memory comes back later."""
     config = fakegpu.parse_config((fake_folder / fakegpu.GPU_FILE).read_text())
     slow = config.model_copy(update={"release_lag_s": 0.3})
     (fake_folder / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(slow))
-    (seen / "rskill.yaml").write_text(MANIFEST)
+    (readings / "rskill.yaml").write_text(MANIFEST)
     sidecar = [
-        sys.executable, str(echo_sidecar.__file__), str(seen), "--name", "calibrate",
-        "--no-arbiter", "--device", gpu.device, "--rskill", str(seen / "rskill.yaml"),
+        sys.executable, str(echo_sidecar.__file__), str(readings), "--name", "calibrate",
+        "--no-arbiter", "--device", gpu.device, "--rskill", str(readings / "rskill.yaml"),
         "--footprint", "1200MiB,1GiB,300MiB",
     ]  # fmt: skip
-    marks = seen / "marks"
-    plan = model.Plan(str(seen / "rskill.yaml"), sidecar, 3, str(marks), 0.6)
+    marks = readings / "marks"
+    plan = model.Plan(str(readings / "rskill.yaml"), sidecar, 3, str(marks), 0.6)
     record = Record(gpu)
     assert recorded(record, *MODEL, json.dumps(asdict(plan))) == 0
     assert record.figures(json.loads(marks.read_text())) == Figures(
@@ -370,17 +372,17 @@ time.sleep(0.2)  # ten readings
 @pytest.mark.e2e
 def test_a_robot_goes_first(
     calibrate: Callable[..., int],
-    seen: Path,
+    readings: Path,
     arbiter_daemon: ArbiterProcess,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     """A request of a higher priority ends the calibration and its program."""
     waiting = subprocess.Popen(
-        [sys.executable, "-c", REQUEST, arbiter_daemon.endpoint, str(seen)],
+        [sys.executable, "-c", REQUEST, arbiter_daemon.endpoint, str(readings)],
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     program = "import sys, pathlib, signal; pathlib.Path(sys.argv[1], 'up').touch(); signal.pause()"
-    assert calibrate("--", sys.executable, "-c", program, str(seen)) == 1
+    assert calibrate("--", sys.executable, "-c", program, str(readings)) == 1
     assert "the GPU is needed" in capfd.readouterr().err
     assert waiting.communicate(timeout=PATIENCE_S)[0] == "granted\n"
 

@@ -27,21 +27,21 @@ from vram_arbiter.schemas.codec import to_map
 
 
 @pytest.fixture
-def machine(tmp_path: Path) -> Machine:
+def sound_machine(tmp_path: Path) -> Machine:
     return sound(tmp_path)
 
 
-def test_a_sound_machine_has_no_finding(machine: Machine) -> None:
-    findings = examine(machine, doctor.CHECKS)
+def test_a_sound_machine_has_no_finding(sound_machine: Machine) -> None:
+    findings = examine(sound_machine, doctor.CHECKS)
     assert [one for one in findings if one.severity is not Severity.OK] == []
     assert len(findings) >= len(doctor.CHECKS)
 
 
 # -- each finding
 @pytest.mark.parametrize("case", CASES, ids=str)
-def test_each_finding_fires_and_names_a_command(case: Case, machine: Machine) -> None:
-    lay(machine.root, dict(case.files))
-    findings = examine(case.change(machine), doctor.CHECKS)
+def test_each_finding_fires_and_names_a_command(case: Case, sound_machine: Machine) -> None:
+    lay(sound_machine.root, dict(case.files))
+    findings = examine(case.change(sound_machine), doctor.CHECKS)
     found = [one for one in findings if one.code == case.code]
     assert found, [one for one in findings if one.severity is not Severity.OK]
     assert case.fix in found[0].fix
@@ -77,22 +77,22 @@ def test_what_cannot_be_examined_is_never_ok(
     code: str,
     files: Mapping[str, str | None],
     change: Callable[[Machine], Machine],
-    machine: Machine,
+    sound_machine: Machine,
 ) -> None:
-    lay(machine.root, files)
-    findings = {one.code: one for one in examine(change(machine), doctor.CHECKS)}
+    lay(sound_machine.root, files)
+    findings = {one.code: one for one in examine(change(sound_machine), doctor.CHECKS)}
     assert findings[code].severity is Severity.UNKNOWN
     assert findings[code].found.startswith("could not look: ")
 
 
 def test_a_file_that_may_not_be_read_is_not_examined(
-    machine: Machine, monkeypatch: pytest.MonkeyPatch
+    sound_machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(path: object) -> list[str]:
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(os, "listdir", refuse)
-    findings = {one.code: one for one in examine(machine, doctor.CHECKS)}
+    findings = {one.code: one for one in examine(sound_machine, doctor.CHECKS)}
     assert findings["units.unknown"].found == (
         "could not look: /etc/systemd/system: Permission denied"
     )
@@ -103,18 +103,18 @@ def test_a_file_that_may_not_be_read_is_not_examined(
     [("UseKernelSuspendNotifiers: 1\nPreserveVideoMemoryAllocations: 0\n", "mem"), ("", "freeze")],
 )
 def test_a_driver_that_needs_no_units_for_a_suspend(
-    params: str, state: str, machine: Machine
+    params: str, state: str, sound_machine: Machine
 ) -> None:
     """NVIDIA 595 with open modules saves memory by the kernel's notifiers."""
-    lay(machine.root, {"/proc/driver/nvidia/params": params, "/sys/power/state": state})
-    findings = examine(machine, (("suspend", doctor.driver.suspend, "x"),))
+    lay(sound_machine.root, {"/proc/driver/nvidia/params": params, "/sys/power/state": state})
+    findings = examine(sound_machine, (("suspend", doctor.driver.suspend, "x"),))
     assert [one.severity for one in findings] == [Severity.OK]
 
 
-def test_a_jetson_has_a_driver_of_its_own(machine: Machine) -> None:
+def test_a_jetson_has_a_driver_of_its_own(sound_machine: Machine) -> None:
     """NVML is missing there, and doctor said that there was no GPU."""
-    lay(machine.root, {**GONE, "/dev/nvmap": ""})
-    (found,) = examine(NOT_FOUND(machine), (("driver", doctor.driver.driver, ""),))
+    lay(sound_machine.root, {**GONE, "/dev/nvmap": ""})
+    (found,) = examine(NOT_FOUND(sound_machine), (("driver", doctor.driver.driver, ""),))
     assert (found.code, found.severity) == ("driver.tegra", Severity.OK)
 
 

@@ -92,6 +92,15 @@ def test_a_crash_after_any_step_leaves_the_last_commit(dataset: Path, steps: int
     assert [note["episode"] for note in commit.notes(dataset)] == [0, 1, 2]
 
 
+@pytest.mark.parametrize(
+    ("line", "wrong"), [('{"episode": "one"}', "episode: Input"), ('{"epi', "JSON: Invalid JSON")]
+)
+def test_a_line_that_is_no_note_is_named(dataset: Path, line: str, wrong: str) -> None:
+    write(dataset, ".runner/episodes.jsonl", f'{{"episode": 0}}\n{line}\n')
+    with pytest.raises(ConfigError, match=f"episodes.jsonl, line 2: {wrong}"):
+        commit.notes(dataset)
+
+
 def test_the_last_episode_is_taken_back_once(dataset: Path) -> None:
     before = tree(dataset)
     commit.begin(dataset)

@@ -111,7 +111,7 @@ def navigator(monkeypatch: pytest.MonkeyPatch) -> Iterator[Navigator]:
 
 
 @pytest.fixture
-def skill(navigator: Navigator, navigate_manifest: Any) -> RosAction:
+def navigation(navigator: Navigator, navigate_manifest: Any) -> RosAction:
     manifest = load_manifest(navigate_manifest)
     assert manifest.ros_integration is not None
     ros = {
@@ -133,56 +133,58 @@ def goal(x: Any, **more: Any) -> Goal:
     return Goal("g", "a/nav", params=params)
 
 
-async def ended(skill: RosAction) -> Any:
+async def ended(navigation: RosAction) -> Any:
     async with asyncio.timeout(PATIENCE_S):
-        while isinstance(step := skill.step(WORLD), Hold):
+        while isinstance(step := navigation.step(WORLD), Hold):
             await asyncio.sleep(0.01)
     return step
 
 
 async def test_goals_succeed_abort_are_rejected_and_are_canceled(
-    skill: RosAction, navigator: Navigator
+    navigation: RosAction, navigator: Navigator
 ) -> None:
     try:
-        await skill.start(goal(1.0))
-        assert await ended(skill) == Done({"result": {"error_code": 0, "error_msg": ""}})
+        await navigation.start(goal(1.0))
+        assert await ended(navigation) == Done({"result": {"error_code": 0, "error_msg": ""}})
         seen = navigator.goals[0].pose
         assert (seen.header.frame_id, seen.pose.orientation.w) == ("map", 1.0)  # ROS's default
-        await skill.finish()
+        await navigation.finish()
 
-        await skill.start(goal(2.0))
+        await navigation.start(goal(2.0))
         with pytest.raises(ModelError, match=r"status 6, error code 1: no way"):
-            await ended(skill)
-        await skill.finish()
+            await ended(navigation)
+        await navigation.finish()
 
         with pytest.raises(GoalRejected):
-            await skill.start(goal(-1.0))
+            await navigation.start(goal(-1.0))
         with pytest.raises(
             BadRequest, match=r"goal_params: pose\.pose\.position\.x: expected a nu"
         ):
-            await skill.start(goal("far"))
+            await navigation.start(goal("far"))
         with pytest.raises(BadRequest, match="goal_params: unknown field tree"):
-            await skill.start(goal(1.0, tree="x"))
+            await navigation.start(goal(1.0, tree="x"))
 
-        await skill.start(goal(5.0))
-        assert isinstance(skill.step(WORLD), Hold)
-        await skill.finish()  # canceled by a person, the deadline or the emergency stop
+        await navigation.start(goal(5.0))
+        assert isinstance(navigation.step(WORLD), Hold)
+        await navigation.finish()  # canceled by a person, the deadline or the emergency stop
         assert len(navigator.canceled) == 1
     finally:
-        await skill.release()
+        await navigation.release()
 
 
 async def test_a_goal_that_the_server_itself_cancels_is_not_a_success(
-    skill: RosAction, navigator: Navigator
+    navigation: RosAction, navigator: Navigator
 ) -> None:
     try:
-        await skill.start(goal(5.0))
-        assert skill._client is not None
-        await skill._client.call("/_action/cancel_goal", {"goal_info": {"goal_id": skill._goal_id}})
+        await navigation.start(goal(5.0))
+        assert navigation._client is not None
+        await navigation._client.call(
+            "/_action/cancel_goal", {"goal_info": {"goal_id": navigation._goal_id}}
+        )
         with pytest.raises(Cancelled, match="status 5"):
-            await ended(skill)
+            await ended(navigation)
     finally:
-        await skill.release()
+        await navigation.release()
 
 
 def test_a_trajectory_goal_round_trips_and_is_never_read_in_part() -> None:

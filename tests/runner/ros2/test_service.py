@@ -92,7 +92,7 @@ def name(monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 @contextmanager
-def serving(name: str, kinds: tuple[Any, Any], answer: Any) -> Iterator[Server]:
+def running_server(name: str, kinds: tuple[Any, Any], answer: Any) -> Iterator[Server]:
     server = Server(name, kinds, answer)
     try:
         yield server
@@ -100,7 +100,7 @@ def serving(name: str, kinds: tuple[Any, Any], answer: Any) -> Iterator[Server]:
         server.close()
 
 
-def manifest_of(name: str, interface: str, default: Any = None, **ros: str) -> RSkillManifest:
+def service_manifest(name: str, interface: str, default: Any = None, **ros: str) -> RSkillManifest:
     package, _, kind = interface.partition("/")
     return RSkillManifest.model_validate(
         {
@@ -139,8 +139,8 @@ async def outcome(skill: RosService, **params: Any) -> Any:
 
 
 async def test_a_service_is_called_and_declines_with_its_message(name: str) -> None:
-    skill = RosService(manifest_of(name, "std_srvs/SetBool", {"data": True}), DOMAIN)
-    with serving(name, SET_BOOL, lambda asked: (asked.data, f"open {asked.data}")) as server:
+    skill = RosService(service_manifest(name, "std_srvs/SetBool", {"data": True}), DOMAIN)
+    with running_server(name, SET_BOOL, lambda asked: (asked.data, f"open {asked.data}")) as server:
         told = {"result": {"success": True, "message": "open True"}}
         assert await outcome(skill) == Done(told)
         with pytest.raises(GoalRejected, match="did not succeed: open False"):
@@ -155,19 +155,19 @@ async def test_a_service_is_called_and_declines_with_its_message(name: str) -> N
 
 
 async def test_requests_and_replies_without_fields_are_those_of_ros(name: str) -> None:
-    skill = RosService(manifest_of(name, "std_srvs/Empty"), DOMAIN)
-    with serving(name, EMPTY, lambda asked: (0,)):
+    skill = RosService(service_manifest(name, "std_srvs/Empty"), DOMAIN)
+    with running_server(name, EMPTY, lambda asked: (0,)):
         assert await outcome(skill) == Done({"result": {}})
         await skill.release()
-    again = RosService(manifest_of(name, "std_srvs/Trigger"), DOMAIN)
-    with serving(name, TRIGGER, lambda asked: (True, "")):
+    again = RosService(service_manifest(name, "std_srvs/Trigger"), DOMAIN)
+    with running_server(name, TRIGGER, lambda asked: (True, "")):
         assert await outcome(again) == Done({"result": {"success": True, "message": ""}})
         await again.release()
 
 
 async def test_a_type_that_the_manifest_defines_is_called(name: str) -> None:
-    skill = RosService(manifest_of(name, "lab_msgs/Sort", definition=DEFINITION), DOMAIN)
-    with serving(name, SORT, lambda asked: (len(asked.parts), [1, 255])) as server:
+    skill = RosService(service_manifest(name, "lab_msgs/Sort", definition=DEFINITION), DOMAIN)
+    with running_server(name, SORT, lambda asked: (len(asked.parts), [1, 255])) as server:
         parts = [{"name": "nut", "offsets": [0.5, 1]}, {"name": "bolt"}]
         told = await outcome(skill, parts=parts)
         assert told == Done({"result": {"count": 2, "picture": [1, 255]}})
@@ -185,11 +185,11 @@ async def test_a_server_that_is_absent_silent_or_leaves_is_told(
     name: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(served_skills, "SERVER_S", 0.2)
-    skill = RosService(manifest_of(name, "std_srvs/Trigger"), DOMAIN)
+    skill = RosService(service_manifest(name, "std_srvs/Trigger"), DOMAIN)
     with pytest.raises(SidecarUnavailable, match=rf"no server of {name} within 0.2 s"):
         await outcome(skill)
     monkeypatch.setattr(served_skills, "SERVER_S", PATIENCE_S)
-    with serving(name, TRIGGER, lambda asked: None) as server:
+    with running_server(name, TRIGGER, lambda asked: None) as server:
         await skill.start(Goal("g", "lab/service", params={}))
         async with asyncio.timeout(PATIENCE_S):
             while not server.requests:
@@ -222,6 +222,6 @@ async def test_a_server_that_is_absent_silent_or_leaves_is_told(
 def test_what_keeps_a_service_from_being_called_is_said_before(
     interface: str, default: Any, definition: str, says: str
 ) -> None:
-    service_misfit(manifest_of("/s", "lab_msgs/Raise", definition="int8 up\n---\n"))
-    found = service_misfit(manifest_of("/s", interface, default, definition=definition))
+    service_misfit(service_manifest("/s", "lab_msgs/Raise", definition="int8 up\n---\n"))
+    found = service_misfit(service_manifest("/s", interface, default, definition=definition))
     assert says in found if says else not found

@@ -91,114 +91,117 @@ def camera(clock: ManualClock) -> FedCamera:
 
 
 @pytest.fixture
-def runner(clock: ManualClock, camera: FedCamera) -> Iterator[HardwareRunner]:
-    runner = hardware_runner(
+def hardware(clock: ManualClock, camera: FedCamera) -> Iterator[HardwareRunner]:
+    hardware = hardware_runner(
         Twin(clock),
         [(camera, 100.0)],
         lambda skill: JointRanges({}),
         clock=clock,
         detections=[DetectionSlot("front", 1000.0)],
     )
-    runner.activate()
-    yield runner
-    runner.deactivate()
+    hardware.activate()
+    yield hardware
+    hardware.deactivate()
 
 
 @pytest.fixture
 def detector(
-    client: DetectorClient, runner: HardwareRunner, clock: ManualClock
+    client: DetectorClient, hardware: HardwareRunner, clock: ManualClock
 ) -> ContinuousDetector:
     config = DetectorConfig(id="a/d", sensor_id="front", rate_hz=1 / PERIOD_S, reload_s=RELOAD_S)
-    (slot,) = runner.robot.detections
-    look = runner.robot.snapshot
+    (slot,) = hardware.robot.detections
+    look = hardware.robot.snapshot
     return ContinuousDetector(config, ("red cube", "ball"), client, look, slot, clock)
 
 
-def seen(runner: HardwareRunner) -> tuple[list[str], str]:
+def detections_of(hardware: HardwareRunner) -> tuple[list[str], str]:
     """What a tick sees: labels, and the diagnostics of the detector."""
-    runner.tick()
-    assert runner.world is not None
-    labels = [one.label for one in runner.world.detected_objects]
-    return labels, runner.world.diagnostics["detector:front"]
+    hardware.tick()
+    assert hardware.world is not None
+    labels = [one.label for one in hardware.world.detected_objects]
+    return labels, hardware.world.diagnostics["detector:front"]
 
 
 async def test_detections_are_in_the_world_state_until_they_are_too_old(
-    detector: ContinuousDetector, runner: HardwareRunner, model: Model, clock: ManualClock
+    detector: ContinuousDetector, hardware: HardwareRunner, model: Model, clock: ManualClock
 ) -> None:
-    assert seen(runner) == ([], "stale")  # it has not looked yet
+    assert detections_of(hardware) == ([], "stale")  # it has not looked yet
     await detector.look()
-    assert seen(runner) == (["red cube"], "ok")
-    assert runner.world is not None
-    (cube,) = runner.world.detected_objects
+    assert detections_of(hardware) == (["red cube"], "ok")
+    assert hardware.world is not None
+    (cube,) = hardware.world.detected_objects
     assert (cube.box, cube.sensor_id, cube.confidence) == ((1.0, 2.0, 3.0, 4.0), "front", 0.9)
     assert cube.stamp_ns == clock.now_ns()  # when its picture was taken
     ((query, fresh_s),) = model.asked
     assert query == "red cube</c>ball"
     assert 0 < fresh_s <= 1.0  # a picture that waits too long is not looked at
     clock.advance(1.0)
-    assert seen(runner) == (["red cube"], "ok")
+    assert detections_of(hardware) == (["red cube"], "ok")
     clock.advance(0.1)
-    assert [seen(runner), seen(runner)] == [([], "stale")] * 2
-    assert runner.result().metadata["detectors"] == {
+    assert [detections_of(hardware), detections_of(hardware)] == [([], "stale")] * 2
+    assert hardware.result().metadata["detectors"] == {
         "front": {"looks": 1, "stale": 1, "withdrawn": 0}
     }
 
 
 async def test_a_late_answer_and_a_camera_without_pictures_are_no_detections(
     detector: ContinuousDetector,
-    runner: HardwareRunner,
+    hardware: HardwareRunner,
     model: Model,
     clock: ManualClock,
     camera: FedCamera,
 ) -> None:
     model.takes_s = 1.5
     await detector.look()
-    assert seen(runner) == ([], "stale")
+    assert detections_of(hardware) == ([], "stale")
     model.takes_s = 0.0
     await detector.look()
     camera.always = False
     clock.advance(0.9)
     await detector.look()  # the camera shows nothing new; the last look is still good
-    assert seen(runner) == (["red cube"], "ok")
+    assert detections_of(hardware) == (["red cube"], "ok")
     clock.advance(0.2)
     await detector.look()
-    assert seen(runner) == ([], "stale")
-    (slot,) = runner.robot.detections
+    assert detections_of(hardware) == ([], "stale")
+    (slot,) = hardware.robot.detections
     assert "camera front" in slot.why
     assert slot.facts() == {"looks": 3, "stale": 2, "withdrawn": 0}
 
 
 async def test_an_evicted_model_sees_nothing_and_is_not_brought_back_from_standby(
-    detector: ContinuousDetector, runner: HardwareRunner, model: Model, clock: ManualClock
+    detector: ContinuousDetector, hardware: HardwareRunner, model: Model, clock: ManualClock
 ) -> None:
     await detector.look()
     model.resident, model.standby = False, True
     await detector.look()
-    assert seen(runner) == ([], "stale")  # at once, though the last look was young enough
-    (slot,) = runner.robot.detections
+    assert detections_of(hardware) == (
+        [],
+        "stale",
+    )  # at once, though the last look was young enough
+    (slot,) = hardware.robot.detections
     assert "evicted" in slot.why
     clock.advance(10 * RELOAD_S)
     await detector.look()
     assert len(model.loads) == 1
     model.come_back()
     await detector.look()
-    assert seen(runner) == (["red cube"], "ok")
+    assert detections_of(hardware) == (["red cube"], "ok")
     assert slot.facts() == {"looks": 2, "stale": 0, "withdrawn": 1}
     model.standby = False  # an eviction that ends its lease: it is loaded again, but not at once
     model.resident = False
     await detector.look()
     clock.advance(RELOAD_S / 2)
     await detector.look()
-    assert (seen(runner), len(model.loads)) == (([], "stale"), 1)
+    assert (detections_of(hardware), len(model.loads)) == (([], "stale"), 1)
     clock.advance(RELOAD_S / 2)
     await detector.look()
-    assert (seen(runner), len(model.loads)) == ((["red cube"], "ok"), 2)
+    assert (detections_of(hardware), len(model.loads)) == ((["red cube"], "ok"), 2)
 
 
 @pytest.mark.parametrize("fault", ["breaks", "an answer that is none", "its server is gone"])
 async def test_a_detector_that_fails_is_absent_and_comes_back(
     detector: ContinuousDetector,
-    runner: HardwareRunner,
+    hardware: HardwareRunner,
     model: Model,
     fault: str,
     caplog: pytest.LogCaptureFixture,
@@ -213,8 +216,8 @@ async def test_a_detector_that_fails_is_absent_and_comes_back(
         model.tokens += 1  # a new process: the old token is none of its own
     for _ in range(3 if fault == "breaks" else 1):
         await detector.look()
-        assert seen(runner) == ([], "stale")
+        assert detections_of(hardware) == ([], "stale")
     assert sum("no detections" in line for line in caplog.messages) == 1
     model.breaks, model.label = False, "ball"
     await detector.look()
-    assert seen(runner) == (["ball"], "ok")
+    assert detections_of(hardware) == (["ball"], "ok")

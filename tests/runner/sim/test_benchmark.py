@@ -536,7 +536,7 @@ def test_each_task_of_lerobots_environment_is_a_cell_with_the_same_seeds(tmp_pat
     assert (cell.complete, cell.why) == (False, "lerobot-eval ended with 1")
 
 
-def stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> list[str]:
+def eval_stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> list[str]:
     """Put a program in the place of lerobot-eval; return the command that starts it by main()."""
     program = folder / "lerobot-eval"
     program.write_text(f"#!{sys.executable}\n{code}\n", encoding="utf-8")
@@ -553,7 +553,7 @@ def test_the_result_of_an_earlier_run_is_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: a run that ended without a result had the rates of the one before."""
-    argv = stand_in(tmp_path, monkeypatch, "")
+    argv = eval_stand_in(tmp_path, monkeypatch, "")
     earlier = tmp_path / "out/point_vram-arbiter-so101-grab/eval_info.json"
     earlier.parent.mkdir(parents=True)
     told = {"task_group": "point", "task_id": 0, "metrics": {"successes": [True]}}
@@ -565,7 +565,7 @@ def test_the_result_of_an_earlier_run_is_not_read(
 
 def test_a_signal_ends_lerobot_eval_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: lerobot-eval went on, with its GPU memory, when the runner was told to end."""
-    argv = stand_in(
+    argv = eval_stand_in(
         tmp_path,
         monkeypatch,
         "import os, signal, time; os.kill(os.getppid(), signal.SIGTERM); time.sleep(600)",

@@ -43,7 +43,9 @@ def world(env: Any) -> WorldState:
     )
 
 
-def drive(skill: Navigate, env: Any, ticks: int = 600) -> tuple[StepOutcome, list[ControlMode]]:
+def drive_until_done(
+    skill: Navigate, env: Any, ticks: int = 600
+) -> tuple[StepOutcome, list[ControlMode]]:
     modes = []
     for _ in range(ticks):
         outcome = skill.step(world(env))
@@ -68,7 +70,7 @@ def test_stands_so_that_a_point_lies_on_the_grasp_spot(
 ) -> None:
     env.reset(0)
     begun(skill, run_async, target_point={"x": 0.70, "y": 0.20, "z": 0.22})
-    done, modes = drive(skill, env)
+    done, modes = drive_until_done(skill, env)
     assert isinstance(done, Done)
     x, y, yaw = env.base_pose()
     spot = CONFIG.grasp_spot_in_base_m
@@ -81,7 +83,7 @@ def test_stands_so_that_a_point_lies_on_the_grasp_spot(
 def test_turns_in_place(skill: Navigate, env: Any, run_async: Run) -> None:
     env.reset(0)
     begun(skill, run_async, turn_rad=-0.6)
-    drive(skill, env)
+    drive_until_done(skill, env)
     assert env.base_pose() == pytest.approx((0.0, 0.0, -0.6), abs=0.02)
 
 
@@ -102,14 +104,14 @@ def test_drives_to_a_pose_of_a_frame(
         },
     }
     begun(skill, run_async, pose=pose)
-    drive(skill, env)
+    drive_until_done(skill, env)
     assert env.base_pose() == pytest.approx(expected, abs=0.03)
 
 
 def test_without_parameters_nothing_drives(skill: Navigate, env: Any, run_async: Run) -> None:
     env.reset(0)
     begun(skill, run_async)
-    drive(skill, env)
+    drive_until_done(skill, env)
     assert env.base_pose() == (0.0, 0.0, 0.0)
 
 
@@ -119,7 +121,7 @@ def test_folds_the_arm_first_and_keeps_the_gripper(
     env.reset(0)
     env.joints.update(shoulder_lift=0.3, gripper=0.1)
     begun(skill, run_async, turn_rad=0.3)
-    _, modes = drive(skill, env)
+    _, modes = drive_until_done(skill, env)
     assert modes.index(ControlMode.BODY_TWIST) == modes.count(ControlMode.JOINT_POSITION)
     rest = dict(zip(ARM_JOINTS, REST_POSE, strict=True)) | {"gripper": 0.1}
     assert env.joints == pytest.approx(rest)
@@ -129,7 +131,7 @@ def test_a_second_goal_starts_afresh(skill: Navigate, env: Any, run_async: Run) 
     env.reset(0)
     for turn in (0.4, -0.4):
         begun(skill, run_async, turn_rad=turn)
-        drive(skill, env)
+        drive_until_done(skill, env)
         run_async(skill.finish())
     assert env.base_pose()[2] == pytest.approx(0.0, abs=0.04)
 
@@ -139,7 +141,7 @@ def test_fails_when_the_base_comes_no_closer(skill: Navigate, env: Any, run_asyn
     far = {"header": {"frame_id": "map"}, "pose": {"position": {"x": 3.0, "y": 0.0}}}
     begun(skill, run_async, pose=far)
     with pytest.raises(GoalRejected, match="from its goal"):
-        drive(skill, env)
+        drive_until_done(skill, env)
     assert env.base_pose()[0] < CONFIG.table_edge_x_m
 
 

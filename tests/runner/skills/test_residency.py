@@ -54,7 +54,7 @@ class Recording(SkillBase):
 
 
 @pytest.fixture
-def skill(navigate_manifest: Path) -> Callable[..., Recording]:
+def make_skill(navigate_manifest: Path) -> Callable[..., Recording]:
     manifest = load_manifest(navigate_manifest)
 
     def make(revision: str = "1", holds_gpu: bool = True, fails: str = "") -> Recording:
@@ -63,8 +63,10 @@ def skill(navigate_manifest: Path) -> Callable[..., Recording]:
     return make
 
 
-async def test_the_same_key_is_reused_whatever_the_prompt(skill: Callable[..., Recording]) -> None:
-    residency, made = Residency(), skill()
+async def test_the_same_key_is_reused_whatever_the_prompt(
+    make_skill: Callable[..., Recording],
+) -> None:
+    residency, made = Residency(), make_skill()
     for prompt in ("red", "blue"):
         got = await residency.acquire(made.key, lambda: made)
         await got.start(Goal("g", "r", prompt=prompt))
@@ -74,9 +76,9 @@ async def test_the_same_key_is_reused_whatever_the_prompt(skill: Callable[..., R
 
 @pytest.mark.parametrize("fails", ["", "release"])
 async def test_another_key_makes_the_old_one_leave_first(
-    skill: Callable[..., Recording], fails: str
+    make_skill: Callable[..., Recording], fails: str
 ) -> None:
-    residency, old, new = Residency(), skill("1", fails=fails), skill("2")
+    residency, old, new = Residency(), make_skill("1", fails=fails), make_skill("2")
     await residency.acquire(old.key, lambda: old)
     assert await residency.acquire(new.key, lambda: new) is new
     assert old.story == ["release"]
@@ -86,22 +88,22 @@ async def test_another_key_makes_the_old_one_leave_first(
     assert residency.resident is None
 
 
-async def test_a_gpu_free_skill_makes_nobody_leave(skill: Callable[..., Recording]) -> None:
-    residency, policy, drive = Residency(), skill("1"), skill("drive", holds_gpu=False)
+async def test_a_gpu_free_skill_makes_nobody_leave(make_skill: Callable[..., Recording]) -> None:
+    residency, policy, drive = Residency(), make_skill("1"), make_skill("drive", holds_gpu=False)
     await residency.acquire(policy.key, lambda: policy)
     assert await residency.acquire(drive.key, lambda: drive) is drive
-    assert await residency.acquire(drive.key, lambda: skill()) is drive
+    assert await residency.acquire(drive.key, lambda: make_skill()) is drive
     assert policy.story == []
     assert residency.resident == policy.key
 
 
 async def test_a_skill_that_cannot_be_made_leaves_the_resident_one_alone(
-    skill: Callable[..., Recording],
+    make_skill: Callable[..., Recording],
 ) -> None:
     def broken() -> Recording:
         raise ManifestInvalid("no")
 
-    residency, old = Residency(), skill("1")
+    residency, old = Residency(), make_skill("1")
     await residency.acquire(old.key, lambda: old)
     with pytest.raises(ManifestInvalid):
         await residency.acquire(SkillKey("x"), broken)
@@ -110,9 +112,9 @@ async def test_a_skill_that_cannot_be_made_leaves_the_resident_one_alone(
 
 
 async def test_a_failed_start_is_cleaned_up_and_can_be_tried_again(
-    skill: Callable[..., Recording],
+    make_skill: Callable[..., Recording],
 ) -> None:
-    made = skill(fails="start")
+    made = make_skill(fails="start")
     with pytest.raises(SidecarUnavailable):
         await made.start(Goal("g", "r"))
     assert made.story == ["start ", "finish"]
@@ -121,8 +123,8 @@ async def test_a_failed_start_is_cleaned_up_and_can_be_tried_again(
     assert made.state == "active"
 
 
-async def test_steps_out_of_order_are_refused(skill: Callable[..., Recording]) -> None:
-    made = skill()
+async def test_steps_out_of_order_are_refused(make_skill: Callable[..., Recording]) -> None:
+    made = make_skill()
     with pytest.raises(BadState, match="idle, not active"):
         made.step(None)  # type: ignore[arg-type]  # refused before it is looked at
     await made.start(Goal("g", "r"))
@@ -136,20 +138,20 @@ async def test_steps_out_of_order_are_refused(skill: Callable[..., Recording]) -
 
 
 async def test_a_skill_that_does_not_let_go_holds_nobody_up(
-    skill: Callable[..., Recording], monkeypatch: pytest.MonkeyPatch
+    make_skill: Callable[..., Recording], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(residency_module, "EVICT_S", 0.05)
 
-    residency, old, new = Residency(), skill("1", fails="hang"), skill("2")
+    residency, old, new = Residency(), make_skill("1", fails="hang"), make_skill("2")
     await residency.acquire(old.key, lambda: old)
     assert await residency.acquire(new.key, lambda: new) is new
     assert residency.resident == new.key
 
 
 async def test_another_revision_of_the_same_skill_is_another_key(
-    skill: Callable[..., Recording],
+    make_skill: Callable[..., Recording],
 ) -> None:
-    residency, old, new = Residency(), skill("1"), skill("2")
+    residency, old, new = Residency(), make_skill("1"), make_skill("2")
     assert old.key.rskill_id == new.key.rskill_id
     assert await residency.acquire(old.key, lambda: old) is old
     assert await residency.acquire(new.key, lambda: new) is new
@@ -158,11 +160,11 @@ async def test_another_revision_of_the_same_skill_is_another_key(
 
 @pytest.mark.parametrize("fails", ["start", "cancel"])
 async def test_a_first_start_that_fails_leaves_nothing_behind(
-    skill: Callable[..., Recording], fails: str
+    make_skill: Callable[..., Recording], fails: str
 ) -> None:
     """Regression: the runner called a skill resident whose model had never come up."""
 
-    residency, old, new = Residency(), skill("1"), skill("2", fails=fails)
+    residency, old, new = Residency(), make_skill("1"), make_skill("2", fails=fails)
     await residency.start(await residency.acquire(old.key, lambda: old), GOAL)
     await old.finish()
     await residency.acquire(new.key, lambda: new)
@@ -177,14 +179,14 @@ async def test_a_first_start_that_fails_leaves_nothing_behind(
     assert old.story[-1] == "release", (
         "it has left already, and comes back by the next goal that wants it"
     )
-    again = skill("1")
+    again = make_skill("1")
     assert await residency.acquire(again.key, lambda: again) is again
 
 
 async def test_a_skill_that_has_served_stays_when_a_later_start_fails(
-    skill: Callable[..., Recording],
+    make_skill: Callable[..., Recording],
 ) -> None:
-    residency, made = Residency(), skill()
+    residency, made = Residency(), make_skill()
     await residency.acquire(made.key, lambda: made)
     await residency.start(made, GOAL)
     await made.finish()
@@ -199,12 +201,12 @@ async def test_a_skill_that_has_served_stays_when_a_later_start_fails(
 
 
 async def test_a_failing_gpu_free_skill_leaves_the_resident_one_alone(
-    skill: Callable[..., Recording],
+    make_skill: Callable[..., Recording],
 ) -> None:
     residency, policy, drive = (
         Residency(),
-        skill("1"),
-        skill("drive", holds_gpu=False, fails="start"),
+        make_skill("1"),
+        make_skill("drive", holds_gpu=False, fails="start"),
     )
     await residency.acquire(policy.key, lambda: policy)
     await residency.acquire(drive.key, lambda: drive)

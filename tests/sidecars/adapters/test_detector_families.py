@@ -21,15 +21,15 @@ WIDTH, HEIGHT = 80, 60
 
 
 @pytest.fixture
-def loaded(saved, manifest):
+def load_detector(saved, manifest):
     """Loads a family's checkpoint in the manifest's precision."""
 
-    def loaded(family, dtype="fp32", save=None):
+    def load_detector(family, dtype="fp32", save=None):
         described = manifest("detector", BLOCK + f"quantization: {{dtype: {dtype}}}\n")
         weights = saved(family, save or tiny_vision.DETECTORS[family])
         return placed(DetectorAdapter(described, weights))
 
-    return loaded
+    return load_detector
 
 
 @pytest.mark.parametrize(
@@ -40,43 +40,43 @@ def loaded(saved, manifest):
         ("red cube. blue ball.", {"red cube", "blue ball"}),
     ],
 )
-def test_grounding_dino_takes_texts_with_a_dot(query, labels, loaded, png):
+def test_grounding_dino_takes_texts_with_a_dot(query, labels, load_detector, png):
     """Its processor joins texts by dots, and hands a list with a dot in it to the tokenizer as it
     is: a TypeError, told as the model's failure."""
-    reply = loaded("grounding_dino").run(
+    reply = load_detector("grounding_dino").run(
         DetectOp(op="detect", image=png(WIDTH, HEIGHT), query=query)
     )
     assert {one["label"] for one in reply["detections"]} <= labels
     assert reply["detections"]
 
 
-def test_grounding_dino_reads_the_text_that_its_processor_would_write(loaded, png):
+def test_grounding_dino_reads_the_text_that_its_processor_would_write(load_detector, png):
     """Joining the texts here must not change what the model reads."""
-    adapter = loaded("grounding_dino")
+    adapter = load_detector("grounding_dino")
     ours = adapter._processor(text=["red cube. ball."])["input_ids"]
     assert ours == adapter._processor(text=[["Red cube", "ball"]])["input_ids"]
 
 
-def test_a_text_without_a_letter_is_refused(loaded, png):
+def test_a_text_without_a_letter_is_refused(load_detector, png):
     """Characters that the tokenizer drops left no token to score: an IndexError."""
     call = DetectOp(op="detect", image=png(WIDTH, HEIGHT), query="\u200b")
     with pytest.raises(BadRequest, match="has no characters that this model reads"):
-        loaded("grounding_dino").run(call)
+        load_detector("grounding_dino").run(call)
 
 
 @pytest.mark.parametrize(("size", "shrunk"), [((2000, 3), "1024 x 2"), ((3, 2000), "2 x 1024")])
-def test_a_picture_of_which_resizing_leaves_nothing_is_refused(size, shrunk, loaded, png):
+def test_a_picture_of_which_resizing_leaves_nothing_is_refused(size, shrunk, load_detector, png):
     """Resizing by the longer side leaves no pixel of the shorter one: the processor's ValueError
     was told as the model's failure."""
     call = DetectOp(op="detect", image=png(*size), query=LABELS)
     with pytest.raises(BadRequest, match=f"Processor cannot read pictures of {shrunk}: "):
-        loaded("grounding_dino").run(call)
+        load_detector("grounding_dino").run(call)
 
 
 @pytest.mark.parametrize("family", ["owlvit", "owlv2", "omdet_turbo"])
-def test_a_picture_that_no_processor_resizes_is_not_passed_on(family, loaded, png):
+def test_a_picture_that_no_processor_resizes_is_not_passed_on(family, load_detector, png):
     """A checkpoint whose processor does not resize handed any size to a model of one size."""
-    adapter = loaded(family)
+    adapter = load_detector(family)
     adapter._processor.image_processor.do_resize = False
     with pytest.raises(BadRequest, match="a picture of 80 x 60; this model reads 64 x 64"):
         adapter.run(DetectOp(op="detect", image=png(WIDTH, HEIGHT), query=LABELS))
@@ -95,9 +95,9 @@ def detect(adapter, picture):
 
 @pytest.mark.parametrize("dtype", ["fp32", "bf16", "fp16"])
 @pytest.mark.parametrize("family", tiny_vision.DETECTORS)
-def test_each_family_detects_in_each_precision(family, dtype, loaded, manifest, png):
+def test_each_family_detects_in_each_precision(family, dtype, load_detector, manifest, png):
     """Grounding DINO raised in 16 bits: its inputs and its own tables are float32."""
-    adapter = loaded(family, dtype)
+    adapter = load_detector(family, dtype)
     kept = {"fp32": "torch.float32", "bf16": "torch.bfloat16", "fp16": "torch.float16"}[dtype]
     (network,) = adapter.networks
     assert {str(one.dtype) for one in network.parameters()} == {kept}
@@ -108,9 +108,9 @@ def test_each_family_detects_in_each_precision(family, dtype, loaded, manifest, 
         assert detect(adapter, png(WIDTH, HEIGHT)) == found, "deterministic"
 
 
-def test_omdet_turbo_with_a_backbone_of_timm(loaded, manifest, png):
+def test_omdet_turbo_with_a_backbone_of_timm(load_detector, manifest, png):
     pytest.importorskip("timm", reason="OmDet-Turbo's published backbone comes from timm")
-    adapter = loaded("omdet_timm", "fp16", tiny_vision.save_omdet_turbo_timm)
+    adapter = load_detector("omdet_timm", "fp16", tiny_vision.save_omdet_turbo_timm)
     assert detect(adapter, png(WIDTH, HEIGHT))
 
 
@@ -135,10 +135,10 @@ def test_the_name_of_a_backbone_is_not_looked_up_on_the_hub(manifest, monkeypatc
 
 
 @pytest.mark.parametrize("family", ["owlvit", "grounding_dino"])
-def test_numbers_that_overflow_are_not_nothing_found(family, loaded, manifest, png):
+def test_numbers_that_overflow_are_not_nothing_found(family, load_detector, manifest, png):
     """A score that is not a number is above no threshold: the answer was an empty list, which
     means that the object is not in view."""
-    adapter = loaded(family)
+    adapter = load_detector(family)
     (network,) = adapter.networks
     for parameter in network.parameters():
         parameter.data.fill_(math.nan)
@@ -146,9 +146,9 @@ def test_numbers_that_overflow_are_not_nothing_found(family, loaded, manifest, p
         detect(adapter, png(WIDTH, HEIGHT))
 
 
-def test_grounding_dino_answers_with_whole_texts(loaded, manifest, png):
+def test_grounding_dino_answers_with_whole_texts(load_detector, manifest, png):
     """The library's reading joins the tokens above 0.25: half a text, or an empty one."""
-    adapter = loaded("grounding_dino")
+    adapter = load_detector("grounding_dino")
     tokens = adapter._processor(images=None, text=[LABELS])["input_ids"][0]
     spans = adapter._spans(tokens, LABELS)
     decode = adapter._processor.tokenizer.decode
@@ -160,9 +160,9 @@ def test_grounding_dino_answers_with_whole_texts(loaded, manifest, png):
 
 
 @pytest.mark.parametrize("family", ["owlvit", "grounding_dino"])
-def test_a_query_that_would_be_cut_off_is_refused(family, loaded, manifest, png):
+def test_a_query_that_would_be_cut_off_is_refused(family, load_detector, manifest, png):
     """Objects beyond the model's tokens were dropped, and answered as not in view."""
-    adapter = loaded(family)
+    adapter = load_detector(family)
     query = ["a small red cube with rounded edges", "a green ball on the left"]
     query.append("a mug without a handle")
     with pytest.raises(BadRequest, match="tokens; this model reads"):

@@ -27,7 +27,7 @@ def call(endpoint: str, observation: Any = None) -> EndpointCall:
     )
 
 
-def observation(**changes: Any) -> dict[str, Any]:
+def arm_observation(**changes: Any) -> dict[str, Any]:
     import numpy as np
 
     picture = np.zeros((128, 256, 3), dtype=np.uint8)
@@ -53,10 +53,10 @@ def adapter() -> GpuPassthroughAdapter:
 def test_the_arm_keeps_the_pose_it_had_at_first(adapter: GpuPassthroughAdapter) -> None:
     import numpy as np
 
-    first = adapter.run(call("get_action", observation()))
+    first = adapter.run(call("get_action", arm_observation()))
     assert first["action"].tolist() == [pytest.approx([0.1, -0.2, 0.3])]
     assert first["confidence"].tolist() == pytest.approx([0.5, 0.5, 0.625])
-    sagged = observation(**{"observation.state": np.array([0.1, -0.25, 0.3])})
+    sagged = arm_observation(**{"observation.state": np.array([0.1, -0.25, 0.3])})
     assert adapter.run(call("get_action", sagged))["action"][0, 1] == pytest.approx(-0.2)
     adapter.run(call("reset"))
     assert adapter.run(call("get_action", sagged))["action"][0, 1] == pytest.approx(-0.25)
@@ -67,7 +67,7 @@ def test_a_white_picture_is_one_and_no_more(adapter: GpuPassthroughAdapter) -> N
     import numpy as np
 
     white = np.full((1440, 2561, 3), 255, dtype=np.uint8)
-    answer = adapter.run(call("get_action", observation(**{FRONT: white})))
+    answer = adapter.run(call("get_action", arm_observation(**{FRONT: white})))
     assert answer["confidence"].tolist() == [1.0, 1.0, 1.0]
 
 
@@ -98,7 +98,7 @@ def test_what_is_missing_or_misshapen_is_refused(
         elif value == "float":
             changes[name] = np.zeros((100, 200, 3), dtype=np.float32)
     with pytest.raises(BadRequest, match=said):
-        adapter.run(call("get_action", observation(**changes)))
+        adapter.run(call("get_action", arm_observation(**changes)))
 
 
 def test_an_observation_that_is_none_and_a_state_that_is_missing(
@@ -107,7 +107,7 @@ def test_an_observation_that_is_none_and_a_state_that_is_missing(
     with pytest.raises(BadRequest, match="a map"):
         adapter.run(call("get_action", "look"))
     with pytest.raises(BadRequest, match="lacks observation"):
-        adapter.run(call("get_action", {FRONT: observation()[FRONT]}))
+        adapter.run(call("get_action", {FRONT: arm_observation()[FRONT]}))
 
 
 def test_without_cameras_there_is_nothing_to_pass_on() -> None:

@@ -127,7 +127,7 @@ def loaded(tmp_path: Path) -> Load:
     return load
 
 
-def detect(adapter: OnnxDetectorAdapter, query: str, **fields: Any) -> list[Any]:
+def labels_and_boxes(adapter: OnnxDetectorAdapter, query: str, **fields: Any) -> list[Any]:
     call = DetectOp(op="detect", image=picture(), query=query, **fields)
     reply = adapter.run(call)
     assert reply["answer"].count("<box>") == len(reply["detections"])
@@ -141,22 +141,22 @@ def test_what_is_asked_for_is_found_in_the_pictures_pixels(
 ) -> None:
     adapter = loaded(form=form, half=half)
     left, right = [0.0, 0.0, 40.0, 60.0], [40.0, 0.0, 80.0, 60.0]
-    assert detect(adapter, "red") == [("red", left)]
-    assert detect(adapter, "a Blue thing</c>red") in (
+    assert labels_and_boxes(adapter, "red") == [("red", left)]
+    assert labels_and_boxes(adapter, "a Blue thing</c>red") in (
         [("a Blue thing", right), ("red", left)],
         [("red", left), ("a Blue thing", right)],
     )
-    assert detect(adapter, "blue", score_threshold=1.0) == []
+    assert labels_and_boxes(adapter, "blue", score_threshold=1.0) == []
 
 
 def test_a_class_that_the_model_has_not_is_refused_and_not_unseen(loaded: Load) -> None:
     with pytest.raises(BadRequest, match=r"knows no 'redness' \(ask for red, blue\)"):
-        detect(loaded(), "red, redness")
+        labels_and_boxes(loaded(), "red, redness")
 
 
 def test_the_longest_label_is_what_a_text_names(loaded: Load) -> None:
     adapter = loaded(manifest_of(CONTRACT.replace("red, blue", "dog, hot dog")))
-    assert detect(adapter, "a hot dog") == [("a hot dog", [40.0, 0.0, 80.0, 60.0])]
+    assert labels_and_boxes(adapter, "a hot dog") == [("a hot dog", [40.0, 0.0, 80.0, 60.0])]
 
 
 @pytest.mark.parametrize(
@@ -176,14 +176,14 @@ def test_a_model_of_another_form_is_refused_at_the_load(
 def test_labels_that_are_not_the_models_classes_are_refused(loaded: Load) -> None:
     adapter = loaded(manifest_of(CONTRACT.replace("red, blue", "red, blue, green")))
     with pytest.raises(ModelError, match="the manifest's labels are the model's classes"):
-        detect(adapter, "red")
+        labels_and_boxes(adapter, "red")
 
 
 def test_the_file_is_the_only_one_or_that_of_the_number_format(
     tmp_path: Path, loaded: Load
 ) -> None:
     export(tmp_path / "model_q4.onnx", "other")
-    assert detect(loaded(), "red")
+    assert labels_and_boxes(loaded(), "red")
     with pytest.raises(ModelError, match=r"expected one .onnx file for fp16 .* found model.onnx, "):
         loaded(manifest_of(quantization="{dtype: fp16}"))
     (tmp_path / "model.onnx").write_bytes(b"")

@@ -22,7 +22,7 @@ CONFIGS = Path(__file__).parents[3] / "configs"
 
 
 @pytest.fixture
-def manifest() -> RSkillManifest:
+def panda_grab() -> RSkillManifest:
     return load_manifest(CONFIGS / "rskills/panda-grab/rskill.yaml")
 
 
@@ -46,17 +46,17 @@ def chunk(adapter: ScriptedPickAdapter, **more: Any) -> Any:
     return adapter.run(EndpointCall(endpoint="get_action", data=data))["action"]
 
 
-def test_its_camera_is_that_of_the_scene(manifest: RSkillManifest) -> None:
+def test_its_camera_is_that_of_the_scene(panda_grab: RSkillManifest) -> None:
     scene = yaml.safe_load((CONFIGS / "scenes/counter.yaml").read_text())
-    told, camera = manifest.policy_extras["scripted_pick"], scene["cameras"]["front"]
+    told, camera = panda_grab.policy_extras["scripted_pick"], scene["cameras"]["front"]
     assert {name: told[name] for name in ("fovy_deg", "pos_m", "look_at_m")} == {
         name: camera[name] for name in ("fovy_deg", "pos_m", "look_at_m")
     }
     assert told["spot_m"] == scene["grasp_spot_in_base_m"]
 
 
-def test_it_drives_the_base_towards_the_color_of_the_task(manifest: RSkillManifest) -> None:
-    adapter = make_adapter(manifest, resolve(str(manifest.weights_uri), CONFIGS))
+def test_it_drives_the_base_towards_the_color_of_the_task(panda_grab: RSkillManifest) -> None:
+    adapter = make_adapter(panda_grab, resolve(str(panda_grab.weights_uri), CONFIGS))
     assert isinstance(adapter, ScriptedPickAdapter)
     red = chunk(adapter)
     assert red.shape == (10, 12)
@@ -78,17 +78,17 @@ def test_it_drives_the_base_towards_the_color_of_the_task(manifest: RSkillManife
     ],
 )
 def test_it_refuses_what_it_cannot_act_on(
-    manifest: RSkillManifest, more: dict[str, Any], error: type[Exception], said: str
+    panda_grab: RSkillManifest, more: dict[str, Any], error: type[Exception], said: str
 ) -> None:
     with pytest.raises(error, match=said):
-        chunk(ScriptedPickAdapter(manifest), **more)
+        chunk(ScriptedPickAdapter(panda_grab), **more)
 
 
-def test_a_wrong_setup_and_an_unknown_adapter_are_told(manifest: RSkillManifest) -> None:
+def test_a_wrong_setup_and_an_unknown_adapter_are_told(panda_grab: RSkillManifest) -> None:
     for extras, said in (
         ({"adapter": "scripted_pick"}, "scripted_pick"),
         ({"adapter": "magic"}, "'magic' is not served"),
     ):
-        wrong = manifest.model_copy(update={"policy_extras": extras})
+        wrong = panda_grab.model_copy(update={"policy_extras": extras})
         with pytest.raises(ConfigError, match=said):
-            make_adapter(wrong, resolve(str(manifest.weights_uri), CONFIGS))
+            make_adapter(wrong, resolve(str(panda_grab.weights_uri), CONFIGS))

@@ -6,7 +6,7 @@ import itertools
 import pytest
 
 from tests.support.core_driver import READING_S, CoreDriver
-from tests.support.scenes import give_back, held
+from tests.support.scenes import give_back, held, verdicts
 from vram_arbiter.arbiter.core.effects import Sample
 from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed, Tick
 from vram_arbiter.schemas import defaults as d
@@ -15,10 +15,6 @@ from vram_arbiter.schemas.ids import GpuId, ProcessKey
 GIB, MIB = d.GIB, d.MIB
 STRANGER = ProcessKey(9, 9)
 GPU = GpuId("GPU-0")
-
-
-def verdicts(driver: CoreDriver) -> list[tuple[str, bool]]:
-    return [(note["verdict"], note["resolved"]) for note in driver.notes("verified")]
 
 
 def total_only(driver: CoreDriver) -> None:
