@@ -60,9 +60,12 @@ LONGEST = (
 IMPORTING = (
     "tests/sidecars/adapters/",
     "tests/sidecars/doors/",
+    "tests/sidecars/test_check.py",
     "tests/sidecars/test_quantization.py",
+    "tests/sidecars/test_weights.py",
     "tests/runner/recording/test_recorder.py",
     "tests/runner/robots/test_lerobot_robot.py",
+    "tests/runner/robots/test_so101_bus.py",
     "tests/runner/robots/test_teleoperation.py",
     "tests/runner/skills/test_policies_as_lerobot.py",
     "tests/training/",

@@ -2,6 +2,7 @@
 surroundings."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -14,9 +15,15 @@ from vram_arbiter.arbiter.eventlog.logfile import LogError
 from vram_arbiter.arbiter.offline.__main__ import main
 
 
+@pytest.fixture(scope="module")
+def written(busy: CoreDriver, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of that run; read only."""
+    return write_log(busy, tmp_path_factory.mktemp("written"))
+
+
 @pytest.fixture
-def log(busy: CoreDriver, tmp_path: Path) -> Path:
-    return write_log(busy, tmp_path)
+def log(written: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(written, tmp_path))
 
 
 def tamper(log: Path, number: int, **changes: object) -> None:
