@@ -192,38 +192,35 @@ def outcomes(room_of: Callable[[int], Room]) -> Counter[str]:
     return ends
 
 
-def random_place(rng: random.Random, near: float = 0.7, far: float = 1.2) -> Point:
+def spot(rng: random.Random, near: float = 0.7, far: float = 1.2) -> Point:
     distance, angle = rng.uniform(near, far), rng.uniform(-0.4, 0.4)
     return (distance * math.cos(angle), distance * math.sin(angle))
 
 
 def hidden_room(seed: int) -> Room:
     rng = random.Random(seed)
-    x, y = random_place(rng)
+    x, y = spot(rng)
     return Room(
         seed,
         [
             Thing("red cube", (x, y), 0.75),
             Thing("blue box", (0.75 * x, 0.75 * y), 0.2),
-            Thing("green ball", random_place(rng), 0.25),
+            Thing("green ball", spot(rng), 0.25),
         ],
     )
 
 
 def room_with_a_double(seed: int) -> Room:
     rng = random.Random(seed)
-    cube, ball = random_place(rng), random_place(rng)
+    cube, ball = spot(rng), spot(rng)
     while math.dist(cube, ball) < 2 * WIDTH_M:
-        ball = random_place(rng)
+        ball = spot(rng)
     return Room(seed, [Thing("red cube", cube, 0.65), Thing("red ball", ball, 0.55)])
 
 
 def room_with_a_fall(seed: int) -> Room:
     rng = random.Random(seed)
-    things = [
-        Thing("red cube", random_place(rng), 0.75),
-        Thing("blue ball", random_place(rng), 0.25),
-    ]
+    things = [Thing("red cube", spot(rng), 0.75), Thing("blue ball", spot(rng), 0.25)]
     return Room(seed, things, falls=rng.randint(2, 8))
 
 

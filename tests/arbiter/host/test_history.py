@@ -42,7 +42,7 @@ def with_history(
     asyncio.run(run())
 
 
-async def read_history(
+async def page(
     history: History, after: int = 0, limit: int = 500, kinds: tuple[str, ...] = ()
 ) -> HistoryReply:
     answer: asyncio.Future[HistoryReply] = asyncio.get_running_loop().create_future()
@@ -55,7 +55,7 @@ def test_a_numbering_has_a_name_as_long_as_its_file(tmp_path: Path) -> None:
     names: list[str] = []
 
     async def test(history: History) -> None:
-        names.append((await read_history(history)).numbering)
+        names.append((await page(history)).numbering)
 
     with_history(tmp_path, test)
     with_history(tmp_path, test)
@@ -74,16 +74,14 @@ def test_events_are_numbered_and_read_back(tmp_path: Path) -> None:
         assert abs(event["at_wall_s"] - time.time()) < PATIENCE_S
         history.append("ready", {})
         history.append("granted", {"lease_id": "L1-2"})
-        assert [e["seq"] for e in (await read_history(history)).events] == [1, 2, 3]
-        assert [e["seq"] for e in (await read_history(history, after=1)).events] == [2, 3]
-        assert [e["seq"] for e in (await read_history(history, limit=1)).events] == [1]
-        assert [
-            e["lease_id"] for e in (await read_history(history, kinds=("granted",))).events
-        ] == [
+        assert [e["seq"] for e in (await page(history)).events] == [1, 2, 3]
+        assert [e["seq"] for e in (await page(history, after=1)).events] == [2, 3]
+        assert [e["seq"] for e in (await page(history, limit=1)).events] == [1]
+        assert [e["lease_id"] for e in (await page(history, kinds=("granted",))).events] == [
             "L1-1",
             "L1-2",
         ]
-        beyond = await read_history(history, after=99)
+        beyond = await page(history, after=99)
         assert (beyond.events, beyond.last_seq, beyond.problem) == ((), 3, "")
 
     with_history(tmp_path, test)
@@ -96,16 +94,16 @@ def test_numbering_goes_on_after_an_orderly_stop(tmp_path: Path) -> None:
 
     async def second(history: History) -> None:
         assert history.append("ready", {})["seq"] == 3
-        events = (await read_history(history)).events
+        events = (await page(history)).events
         assert [(e["seq"], e["kind"]) for e in events] == [
             (1, "granted"),
             (2, CLEAN_END),
             (3, "ready"),
         ]
         assert events[0]["lease_id"] == "L1-1"
-        assert [
-            e["seq"] for e in (await read_history(history, kinds=("granted", "nonsense"))).events
-        ] == [1]
+        assert [e["seq"] for e in (await page(history, kinds=("granted", "nonsense"))).events] == [
+            1
+        ]
 
     with_history(tmp_path, first)
     with_history(tmp_path, second)
@@ -126,15 +124,13 @@ def test_what_memory_no_longer_holds_is_found_on_disk(tmp_path: Path) -> None:
     async def test(history: History) -> None:
         for number in range(RING_EVENTS + 50):
             history.append("odd" if number % 2 else "even", {"number": number})
-        old = (await read_history(history, after=10, limit=3)).events
+        old = (await page(history, after=10, limit=3)).events
         assert [e["seq"] for e in old] == [11, 12, 13]
-        assert [
-            e["number"] for e in (await read_history(history, kinds=("odd",), limit=2)).events
-        ] == [
+        assert [e["number"] for e in (await page(history, kinds=("odd",), limit=2)).events] == [
             1,
             3,
         ]
-        assert len((await read_history(history, limit=5000)).events) == RING_EVENTS + 50
+        assert len((await page(history, limit=5000)).events) == RING_EVENTS + 50
 
     with_history(tmp_path, test)
 
@@ -146,7 +142,7 @@ def test_number_and_age_are_bounded(tmp_path: Path) -> None:
             history.append("x", {})
 
     async def look(history: History) -> None:
-        assert (await read_history(history)).events[0]["seq"] > module.PRUNE_EVERY_EVENTS - 200
+        assert (await page(history)).events[0]["seq"] > module.PRUNE_EVERY_EVENTS - 200
 
     with_history(tmp_path, many)
     with_history(tmp_path, look)
@@ -202,7 +198,7 @@ def test_a_broken_database_is_put_aside(tmp_path: Path) -> None:
     assert list(tmp_path.glob("history.sqlite.corrupt-*"))
 
     async def again(history: History) -> None:
-        assert len((await read_history(history)).events) == 1
+        assert len((await page(history)).events) == 1
 
     with_history(tmp_path, again)
 
@@ -213,7 +209,7 @@ def test_without_a_disk_it_lives_in_memory(tmp_path: Path) -> None:
     async def test(history: History) -> None:
         for _ in range(RING_EVENTS + 5):
             history.append("x", {})
-        assert (await read_history(history)).events[0]["seq"] == 6
+        assert (await page(history)).events[0]["seq"] == 6
 
     with_history(tmp_path, test)
 
@@ -293,7 +289,7 @@ def test_an_event_that_cannot_be_read_does_not_hide_the_others(
     async def test(history: History) -> None:
         for _ in range(RING_EVENTS + 5):
             history.append("x", {})
-        found = (await read_history(history, limit=3)).events
+        found = (await page(history, limit=3)).events
         assert [event["seq"] for event in found] == [1, 3, SKIPPED_AFTER_CRASH + 4]
         assert (found[1]["kind"], found[1]["at_wall_s"]) == ("unreadable", 9e9)
 

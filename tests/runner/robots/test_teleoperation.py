@@ -137,7 +137,7 @@ def parts_of(bus: ServoBus, folder: Path, **transport: Any) -> Parts:
 
 
 @pytest.fixture
-async def led_arm(bus: ServoBus, calibrated: Path, tmp_path: Path) -> AsyncIterator[Bench]:
+async def rig(bus: ServoBus, calibrated: Path, tmp_path: Path) -> AsyncIterator[Bench]:
     async with AsyncExitStack() as stack:
         yield await bench_of(stack, bus, calibrated, tmp_path)
 
@@ -197,124 +197,120 @@ async def bench_of(
     return made
 
 
-async def test_the_arm_goes_to_the_leader_without_a_jump_and_then_follows_it(
-    led_arm: Bench,
-) -> None:
-    led_arm.lead("shoulder_pan", 0.3)
-    goal = await led_arm.client.send_goal(NAME, prompt="wave")
-    await led_arm.until_at("shoulder_pan", 0.3)
-    aligned = len(led_arm.ticks.ticks)
-    assert led_arm.ticks.longest_step() <= ALIGN_RAD_S / RATE_HZ + 1e-6
-    led_arm.lead("shoulder_pan", -0.3)
-    await led_arm.until_at("shoulder_pan", -0.3)
-    assert ALIGN_RAD_S / RATE_HZ < led_arm.ticks.longest_step(aligned - 1) <= 4.7 / RATE_HZ
-    await led_arm.client.take_over("end")
+async def test_the_arm_goes_to_the_leader_without_a_jump_and_then_follows_it(rig: Bench) -> None:
+    rig.lead("shoulder_pan", 0.3)
+    goal = await rig.client.send_goal(NAME, prompt="wave")
+    await rig.until_at("shoulder_pan", 0.3)
+    aligned = len(rig.ticks.ticks)
+    assert rig.ticks.longest_step() <= ALIGN_RAD_S / RATE_HZ + 1e-6
+    rig.lead("shoulder_pan", -0.3)
+    await rig.until_at("shoulder_pan", -0.3)
+    assert ALIGN_RAD_S / RATE_HZ < rig.ticks.longest_step(aligned - 1) <= 4.7 / RATE_HZ
+    await rig.client.take_over("end")
     result = await goal.result(60)
     assert (result["status"], result["data"]["ended_by"]) == ("succeeded", "operator")
-    assert all(tick.intervention for tick in led_arm.ticks.ticks[:-1])
+    assert all(tick.intervention for tick in rig.ticks.ticks[:-1])
 
 
 async def test_a_leader_that_is_unplugged_makes_the_arm_hold_and_then_fails_the_goal(
-    led_arm: Bench,
+    rig: Bench,
 ) -> None:
-    goal = await led_arm.client.send_goal(NAME)
-    await led_arm.until_at("shoulder_pan", 0.0)
-    led_arm.bus.cut()
-    led_arm.lead("shoulder_pan", 1.0)  # nobody hears of it
+    goal = await rig.client.send_goal(NAME)
+    await rig.until_at("shoulder_pan", 0.0)
+    rig.bus.cut()
+    rig.lead("shoulder_pan", 1.0)  # nobody hears of it
     result = await goal.result(60)
     assert (result["status"], result["code"]) == ("failed", "state_stale")
     assert "the teleoperator is stale" in result["message"]
-    assert led_arm.parts.hal.sent()["shoulder_pan"] == pytest.approx(0.0, abs=0.01)
-    assert not led_arm.ticks.ticks[-1].result.action_applied
-    assert led_arm.ticks.ticks[-1].intervention
-    result = await (await led_arm.client.send_goal(NAME)).result(60)
+    assert rig.parts.hal.sent()["shoulder_pan"] == pytest.approx(0.0, abs=0.01)
+    assert not rig.ticks.ticks[-1].result.action_applied
+    assert rig.ticks.ticks[-1].intervention
+    result = await (await rig.client.send_goal(NAME)).result(60)
     assert (result["status"], result["code"]) == ("failed", "robot_fault")
-    led_arm.bus.mend()
-    step = len(led_arm.ticks.ticks)
-    goal = await led_arm.client.send_goal(NAME)
-    await led_arm.until_at("shoulder_pan", 0.1)  # on its way to where the leader is by now
+    rig.bus.mend()
+    step = len(rig.ticks.ticks)
+    goal = await rig.client.send_goal(NAME)
+    await rig.until_at("shoulder_pan", 0.1)  # on its way to where the leader is by now
     sag = 0.01  # between the last target and where the arm stands, from which it begins
-    assert led_arm.ticks.longest_step(step - 1) <= ALIGN_RAD_S / RATE_HZ + sag
+    assert rig.ticks.longest_step(step - 1) <= ALIGN_RAD_S / RATE_HZ + sag
     await goal.cancel()
     await goal.result(60)
 
 
-async def test_an_operator_who_pushes_against_a_limit_does_not_fail_the_goal(
-    led_arm: Bench,
-) -> None:
-    goal = await led_arm.client.send_goal(NAME)
-    await led_arm.until_at("shoulder_pan", 0.0)
-    led_arm.parts.gate._memory.tripped = "a wall"
-    while sum(not tick.result.action_applied for tick in led_arm.ticks.ticks) < 30:
+async def test_an_operator_who_pushes_against_a_limit_does_not_fail_the_goal(rig: Bench) -> None:
+    goal = await rig.client.send_goal(NAME)
+    await rig.until_at("shoulder_pan", 0.0)
+    rig.parts.gate._memory.tripped = "a wall"
+    while sum(not tick.result.action_applied for tick in rig.ticks.ticks) < 30:
         await asyncio.sleep(0.01)
-    led_arm.parts.gate._memory.tripped = ""
-    led_arm.lead("shoulder_pan", 0.1)
-    await led_arm.until_at("shoulder_pan", 0.1)
+    rig.parts.gate._memory.tripped = ""
+    rig.lead("shoulder_pan", 0.1)
+    await rig.until_at("shoulder_pan", 0.1)
     await goal.cancel()
     assert (await goal.result(60))["data"]["withheld"] >= 30
 
 
 async def test_a_take_over_ends_the_policys_use_and_gives_back_to_a_fresh_one(
-    led_arm: Bench,
+    rig: Bench,
 ) -> None:
-    goal = await led_arm.client.send_goal("test/grab", prompt="grab it")
-    while len(led_arm.sidecar.observations) < 2:
+    goal = await rig.client.send_goal("test/grab", prompt="grab it")
+    while len(rig.sidecar.observations) < 2:
         await asyncio.sleep(0.01)
-    assert (await led_arm.client.take_over("take"))["goal_id"] == goal.goal_id
-    assert [use.ended for use in led_arm.arbiter.uses] == [1]
-    asked = len(led_arm.sidecar.observations)
-    led_arm.lead("shoulder_pan", 0.3)
-    await led_arm.until_at("shoulder_pan", 0.3)
-    assert len(led_arm.sidecar.observations) == asked
+    assert (await rig.client.take_over("take"))["goal_id"] == goal.goal_id
+    assert [use.ended for use in rig.arbiter.uses] == [1]
+    asked = len(rig.sidecar.observations)
+    rig.lead("shoulder_pan", 0.3)
+    await rig.until_at("shoulder_pan", 0.3)
+    assert len(rig.sidecar.observations) == asked
     with pytest.raises(BadState, match="already"):
-        await led_arm.client.take_over("take")
-    before = len(led_arm.sidecar.calls)
-    led_arm.sidecar.action = [[0.3, *led_arm.sidecar.action[0][1:]]] * 3
-    back = len(led_arm.ticks.ticks)
-    await led_arm.client.take_over("give_back")
-    await led_arm.until_phase("running")
-    while len(led_arm.sidecar.observations) == asked:
+        await rig.client.take_over("take")
+    before = len(rig.sidecar.calls)
+    rig.sidecar.action = [[0.3, *rig.sidecar.action[0][1:]]] * 3
+    back = len(rig.ticks.ticks)
+    await rig.client.take_over("give_back")
+    await rig.until_phase("running")
+    while len(rig.sidecar.observations) == asked:
         await asyncio.sleep(0.01)
-    assert led_arm.sidecar.calls[before : before + 3] == ["load", "reset", "get_action"]
-    fresh = led_arm.sidecar.observations[asked]["observation.state"]
+    assert rig.sidecar.calls[before : before + 3] == ["load", "reset", "get_action"]
+    fresh = rig.sidecar.observations[asked]["observation.state"]
     assert fresh[0] == pytest.approx(0.3, abs=0.15)  # the servo lags; the start pose has 0
-    assert [use.ended for use in led_arm.arbiter.uses] == [1, 0]
-    assert led_arm.ticks.longest_step(back - 1) < 0.02  # it did not go to its start pose again
+    assert [use.ended for use in rig.arbiter.uses] == [1, 0]
+    assert rig.ticks.longest_step(back - 1) < 0.02  # it did not go to its start pose again
     await goal.cancel()
     assert (await goal.result(60))["status"] == "canceled"
-    assert [use.ended for use in led_arm.arbiter.uses] == [1, 1]
-    runs = [tick.intervention for tick in led_arm.ticks.ticks]
+    assert [use.ended for use in rig.arbiter.uses] == [1, 1]
+    runs = [tick.intervention for tick in rig.ticks.ticks]
     changes = sum(a != b for a, b in itertools.pairwise(runs))
     assert (runs[0], runs[-1], changes) == (False, False, 2)
 
 
-async def test_a_policy_that_cannot_go_on_fails_the_goal(led_arm: Bench) -> None:
-    goal = await led_arm.client.send_goal("test/grab", prompt="grab it")
-    await led_arm.until_phase("running")
-    await led_arm.client.take_over("take")
-    led_arm.sidecar.load_error = RobotFault("out of order")
-    await led_arm.client.take_over("give_back")
+async def test_a_policy_that_cannot_go_on_fails_the_goal(rig: Bench) -> None:
+    goal = await rig.client.send_goal("test/grab", prompt="grab it")
+    await rig.until_phase("running")
+    await rig.client.take_over("take")
+    rig.sidecar.load_error = RobotFault("out of order")
+    await rig.client.take_over("give_back")
     result = await goal.result(60)
     assert (result["status"], result["data"].get("ended_by")) == ("failed", None)
     assert "out of order" in result["message"]
 
 
-async def test_a_dead_leader_takes_nothing_over(led_arm: Bench) -> None:
-    goal = await led_arm.client.send_goal("test/grab", prompt="grab it")
-    await led_arm.until_phase("running")
-    led_arm.bus.cut()
+async def test_a_dead_leader_takes_nothing_over(rig: Bench) -> None:
+    goal = await rig.client.send_goal("test/grab", prompt="grab it")
+    await rig.until_phase("running")
+    rig.bus.cut()
     with pytest.raises(RobotFault, match="does not answer"):
-        await led_arm.client.take_over("take")
-    asked = len(led_arm.sidecar.observations)
-    while len(led_arm.sidecar.observations) < asked + 2:  # the policy goes on
+        await rig.client.take_over("take")
+    asked = len(rig.sidecar.observations)
+    while len(rig.sidecar.observations) < asked + 2:  # the policy goes on
         await asyncio.sleep(0.01)
     for do in ("give_back", "end"):
         with pytest.raises(BadState, match="does not have the robot"):
-            await led_arm.client.take_over(do)  # type: ignore[arg-type]
+            await rig.client.take_over(do)  # type: ignore[arg-type]
     await goal.cancel()
     await goal.result(60)
     with pytest.raises(BadState, match="does not move the robot"):
-        await led_arm.client.take_over("take")
+        await rig.client.take_over("take")
 
 
 @pytest.mark.nightly  # lerobot's writer and reader, 30 s
@@ -330,16 +326,16 @@ async def test_demonstrations_and_take_overs_are_rows_that_lerobot_reads(
     recorder = DatasetRecorder(tmp_path / "set", rate_hz=RATE_HZ, cameras=(), robot="bench")
     await asyncio.to_thread(recorder.start)
     async with AsyncExitStack() as stack:
-        led_arm = await bench_of(stack, bus, calibrated, tmp_path, recorder)
+        rig = await bench_of(stack, bus, calibrated, tmp_path, recorder)
         read, write = os.pipe()
         monkeypatch.setattr("sys.stdin", stack.enter_context(os.fdopen(read)))
-        words = ["record", "wave", "--episodes", "2", "--endpoint", led_arm.client.endpoint]
+        words = ["record", "wave", "--episodes", "2", "--endpoint", rig.client.endpoint]
         args = parse(words)
         recording = asyncio.create_task(args.run(args))
         for number, verdict in enumerate(("k", "d", "k")):
             os.write(write, b"\n")
-            ticks = len(led_arm.ticks.ticks)
-            while len(led_arm.ticks.ticks) < ticks + 5:
+            ticks = len(rig.ticks.ticks)
+            while len(rig.ticks.ticks) < ticks + 5:
                 await asyncio.sleep(0.01)
             os.write(write, f"\n{verdict}\n".encode())
             while recorder.counts.episodes + recorder.counts.discarded <= number:
@@ -348,17 +344,17 @@ async def test_demonstrations_and_take_overs_are_rows_that_lerobot_reads(
         os.close(write)
         assert "2 of 2 episodes are kept" in capsys.readouterr().out
 
-        goal = await led_arm.client.send_goal("test/grab", prompt="grab it")
-        while len(led_arm.sidecar.observations) < 2:
+        goal = await rig.client.send_goal("test/grab", prompt="grab it")
+        while len(rig.sidecar.observations) < 2:
             await asyncio.sleep(0.01)
         assert parse(["takeover"]).do == "take"
         for do in ("take", "give-back"):
-            args = parse(["takeover", do, "--endpoint", led_arm.client.endpoint])
+            args = parse(["takeover", do, "--endpoint", rig.client.endpoint])
             assert await args.run(args) == 0
-            ticks = len(led_arm.ticks.ticks)
-            while len(led_arm.ticks.ticks) < ticks + 5:
+            ticks = len(rig.ticks.ticks)
+            while len(rig.ticks.ticks) < ticks + 5:
                 await asyncio.sleep(0.01)
-        await led_arm.until_phase("running")
+        await rig.until_phase("running")
         await goal.cancel()
         await goal.result(60)
     await asyncio.to_thread(recorder.close)
@@ -379,7 +375,7 @@ async def test_demonstrations_and_take_overs_are_rows_that_lerobot_reads(
     assert {row["task"] for row in rows if row["episode_index"] < 2} == {"wave"}
     assert all(shown[0][:-1])
     assert all(shown[1][:-1])
-    told = [tick.intervention for tick in led_arm.ticks.ticks if tick.goal.rskill_id == "test/grab"]
+    told = [tick.intervention for tick in rig.ticks.ticks if tick.goal.rskill_id == "test/grab"]
     assert shown[2] == told[-len(shown[2]) :]
     assert {*shown[2]} == {True, False}
 

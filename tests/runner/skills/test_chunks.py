@@ -33,7 +33,7 @@ class Policy:
         self.futures[-1].set_result([(float(number), float(i)) for i in range(self.size)])
 
 
-def played_rows(player: ChunkPlayer, policy: Policy, rows: int, delay: int = 0) -> list[Row]:
+def rows_of(player: ChunkPlayer, policy: Policy, rows: int, delay: int = 0) -> list[Row]:
     """Return the next rows; each request is answered `delay` steps after its own."""
     played: list[Row] = []
     waited = 0
@@ -57,21 +57,14 @@ def test_a_chunk_that_is_asked_for_early_plays_from_the_step_where_it_begins() -
     """
     policy = Policy(6)
     player = ChunkPlayer(policy.fetch, prefetch_at=2, keep=3)
-    assert played_rows(player, policy, 9) == [
+    assert rows_of(player, policy, 9) == [
         (0, 0), (0, 1),
         (1, 1), (1, 2),  # asked for before (0, 1), there after it: it begins at its row 1
         (2, 1), (2, 2), (3, 1), (3, 2), (4, 1),
     ]  # fmt: skip
     policy = Policy(6)
     player = ChunkPlayer(policy.fetch, prefetch_at=2, keep=3)
-    assert played_rows(player, policy, 6, delay=1) == [
-        (0, 0),
-        (0, 1),
-        (0, 2),
-        (1, 2),
-        (1, 3),
-        (1, 4),
-    ]
+    assert rows_of(player, policy, 6, delay=1) == [(0, 0), (0, 1), (0, 2), (1, 2), (1, 3), (1, 4)]
 
 
 def test_a_world_that_waits_is_the_same_whenever_answers_come() -> None:
@@ -80,7 +73,7 @@ def test_a_world_that_waits_is_the_same_whenever_answers_come() -> None:
     for delay in (0, 1):
         policy = Policy(6)
         player = ChunkPlayer(policy.fetch, prefetch_at=2, keep=3, wait_s=1e-9)
-        played.append(played_rows(player, policy, 6, delay))
+        played.append(rows_of(player, policy, 6, delay))
     assert played[0] == played[1] == [(0, 0), (0, 1), (0, 2), (1, 2), (1, 3), (1, 4)]
 
 
@@ -132,14 +125,7 @@ def test_a_robot_that_stood_still_misses_no_row() -> None:
     """The chunk still begins where the robot is: rows are skipped for steps that were played."""
     policy = Policy(6)
     player = ChunkPlayer(policy.fetch, prefetch_at=2, keep=3)
-    assert played_rows(player, policy, 6, delay=9) == [
-        (0, 0),
-        (0, 1),
-        (0, 2),
-        (1, 2),
-        (1, 3),
-        (1, 4),
-    ]
+    assert rows_of(player, policy, 6, delay=9) == [(0, 0), (0, 1), (0, 2), (1, 2), (1, 3), (1, 4)]
 
 
 def standing(prefetch_at: int, delay: int) -> int:
@@ -166,7 +152,7 @@ def test_what_the_chunks_say_about_the_steps_to_come() -> None:
     policy = Policy(6)
     player = ChunkPlayer(policy.fetch, prefetch_at=2, keep=3)
     assert (player.left_over(10), player.delay) == ([], 0)
-    played_rows(player, policy, 1)
+    rows_of(player, policy, 1)
     assert player.delay == 2
     assert player.left_over(10) == [(0, 1), (0, 2), (0, 3), (0, 4), (0, 5)]
     assert player.left_over(3) == [(0, 1), (0, 2), (0, 3)]
