@@ -1,21 +1,31 @@
-"""Makers of a deployment's skills: policies in sidecars, ROS 2 actions and services."""
+"""Makers of a deployment's skills: policies in sidecars, ROS 2 actions and services, the
+operator's.
+"""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.runner.cli.common import sidecars_given
-from vram_arbiter.runner.cli.deployment import DeploymentFile, Parts
+from vram_arbiter.runner.cli.deployment import DeploymentFile, Parts, read_deployment
 from vram_arbiter.runner.goals.catalogue import Maker
+from vram_arbiter.runner.robots.so101 import lerobot_units_of
+from vram_arbiter.runner.robots.teleoperators import Teleoperator, make_teleoperator
+from vram_arbiter.runner.safety.limits import Limits
 from vram_arbiter.runner.skills.ros_standins import StandIn, StandIns
-from vram_arbiter.runner.skills.teleop import INTERFACE, Teleop
+from vram_arbiter.runner.skills.teleop import INTERFACE, MANIFEST, Teleop
 from vram_arbiter.schemas.config.robot import RobotEnvironment
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import Kind
 from vram_arbiter.schemas.runtime.extras import need
+
+if TYPE_CHECKING:
+    from vram_arbiter.runner.sim.arm_env import ArmEnvironment
 
 MakeMakers = Callable[[Parts, AsyncClient | None], Mapping[Kind, Maker]]
 """How skills of each kind are made for this robot, with or without an arbiter."""
@@ -37,7 +47,7 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
             given,
             arbiter,
             period_s=1.0 / file.robot.rate_hz,
-            others={**ros_servers(file.robot), **operators(parts, 1.0 / file.robot.rate_hz)},
+            others={**ros_servers(file.robot), **operator_of(parts, 1.0 / file.robot.rate_hz)},
         )
         return {**made, Kind.ROS_SERVICE: services}
 
@@ -82,11 +92,39 @@ def _domain(setting: str) -> int:
         raise ConfigError(f"{setting}: {error}") from error
 
 
-def operators(parts: Parts, period_s: float) -> dict[str, StandIn]:
-    """Return the operator's skill, by interface; empty for a robot without a teleoperator."""
-    if (teleoperator := parts.teleoperator) is None:
+def operator_of(parts: Parts, period_s: float) -> dict[str, StandIn]:
+    """Return the skill of a deployment's operator, as `operators`; empty: no teleoperator."""
+    if parts.teleoperator is None:
         return {}
-    limits, sent = parts.gate.limits, parts.hal.sent
+    return operators(parts.teleoperator, parts.gate.limits, parts.hal.sent, period_s)
+
+
+def simulated_operator(
+    file: Path | None, world: ArmEnvironment, period_s: float
+) -> dict[str, StandIn]:
+    """Return the operator's skill in a simulated world, by the `teleop` of a deployment file, as
+    `operators`. Raises ConfigError: the file is wrong, or its teleoperator does not fit the robot.
+    """
+    if file is None:
+        return {}
+    deployment = read_deployment(file)
+    if (config := deployment.robot.teleop) is None:
+        raise deployment.error(("teleop", "is missing: it names the operator's device"))
+    units = lerobot_units_of(world.robot)
+    try:
+        teleoperator = make_teleoperator(config, world.robot, units, period_s=period_s)
+    except ConfigError as error:
+        raise deployment.located(error, "teleop") from error
+    return operators(teleoperator, world.limits_for(MANIFEST), world.sent, period_s)
+
+
+def operators(
+    teleoperator: Teleoperator,
+    limits: Limits,
+    sent: Callable[[], Mapping[str, float]],
+    period_s: float,
+) -> dict[str, StandIn]:
+    """Return the operator's skill, by interface. Args: as for `Teleop`."""
     made = StandIn(
         lambda manifest: Teleop(manifest, teleoperator, limits, period_s=period_s, sent=sent),
         frozenset({ControlMode.JOINT_POSITION}),

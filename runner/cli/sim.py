@@ -31,6 +31,7 @@ from vram_arbiter.runner.cli.common import (
     warm_up,
 )
 from vram_arbiter.runner.cli.display import add_display_flag, check_display_flag, display_runner
+from vram_arbiter.runner.cli.makers import simulated_operator
 from vram_arbiter.runner.cli.numbers import not_negative
 from vram_arbiter.runner.cli.recording import (
     add_record_flags,
@@ -59,6 +60,10 @@ def add_parser(commands: Commands) -> argparse.ArgumentParser:
     sim.add_argument("--seed", type=int, default=0, help="seed of the scene")
     add_record_flags(sim, "every goal")
     add_display_flag(sim)
+    sim.add_argument(
+        "--teleop", metavar="FILE", type=Path,
+        help="deployment file whose `teleop` moves the arm, on `record` and `takeover`",
+    )  # fmt: skip
     sim.add_argument("--video", type=Path, help="write the run as H.264 video to this file")
     sim.add_argument(
         "--timings", type=Path,
@@ -94,6 +99,7 @@ async def run(args: argparse.Namespace) -> int:
     from vram_arbiter.runner.sim.truth import truth_as_wire
     from vram_arbiter.runner.sim.video import VideoRecorder
     from vram_arbiter.runner.sim.worlds import WORLDS, makers_of
+    from vram_arbiter.runner.skills import teleop
     from vram_arbiter.runner.skills.sidecar_policy import LOCKSTEP_WAIT_S
 
     chosen = WORLDS[args.robot]
@@ -106,6 +112,9 @@ async def run(args: argparse.Namespace) -> int:
     check_sidecars(given, manifests)
     period_s = 1.0 / (args.rate or AS_FAST_AS_POSSIBLE_HZ)
     wait_s = LOCKSTEP_WAIT_S if args.lockstep or args.rate == 0 else 0.0
+    operator = simulated_operator(args.teleop, world, period_s)
+    if operator:
+        manifests.append(teleop.MANIFEST)
     clock = SystemClock()
     stopping = asyncio.Event()
     async with contextlib.AsyncExitStack() as stack:
@@ -146,7 +155,7 @@ async def run(args: argparse.Namespace) -> int:
             control,
             Catalogue(
                 manifests,
-                makers_of(world, given, arbiter, period_s=period_s, wait_s=wait_s),
+                makers_of(world, given, arbiter, period_s=period_s, wait_s=wait_s, others=operator),
                 refused=unlicensed(manifests, allow_noncommercial=args.allow_noncommercial),
                 body=chosen.body,
             ),

@@ -86,8 +86,12 @@ def makers_of(
     period_s: float,
     wait_s: float,
     latency_steps: int | None = None,
+    others: Mapping[str, StandIn] | None = None,
 ) -> dict[Kind, Maker]:
-    """Return the makers of the skills that can act in this world; as `SidecarPolicy`."""
+    """Return the makers of the skills that can act in this world; as `SidecarPolicy`.
+
+    Args: `others` stand in for interfaces beside navigation.
+    """
     from vram_arbiter.runner.skills import makers
     from vram_arbiter.runner.skills.navigate import Navigate
 
@@ -107,5 +111,5 @@ def makers_of(
         period_s=period_s,
         wait_s=wait_s,
         latency_steps=latency_steps,
-        others={NAVIGATE: navigate},
+        others={NAVIGATE: navigate, **(others or {})},
     )

@@ -22,7 +22,7 @@ from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.runner.__main__ import parse
 from vram_arbiter.runner.cli.deployment import DeploymentFile, Parts, make_parts
-from vram_arbiter.runner.cli.makers import operators
+from vram_arbiter.runner.cli.makers import operator_of
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
@@ -173,7 +173,7 @@ async def bench_of(
 
     makers = {
         Kind.VLA: policy,
-        Kind.ROS_ACTION: StandIns(operators(parts, 1 / RATE_HZ), JOINTS),
+        Kind.ROS_ACTION: StandIns(operator_of(parts, 1 / RATE_HZ), JOINTS),
     }
     control = await stack.enter_async_context(ControlThread(runner))
     endpoint = f"ipc://{folder}/runner.sock"
