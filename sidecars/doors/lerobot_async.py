@@ -42,15 +42,17 @@ from vram_arbiter.sidecars.doors.lerobot_messages import (
 )
 from vram_arbiter.sidecars.doors.offers import Offers
 from vram_arbiter.sidecars.doors.robot import Robot
+from vram_arbiter.sidecars.port import Conduct
 
 SERVICE: Final = "transport.AsyncInference"
 WAIT_S: Final = 2.0
 """How long a request for actions waits for an observation, as at lerobot's server."""
 STREAM_S: Final = 10.0  # how long one observation may take to arrive
-REFUSED_S: Final = 0.5
-"""How long a request that is wrong waits for its refusal: the next one comes no sooner."""
+BEGIN_S: Final = 0.5  # of a request that a robot sends once: the next one comes no sooner
+CHUNKS_MAX: Final = 64  # of one observation: lerobot's are of 2 MiB, but for the last
 REQUESTS_MAX: Final = 256  # at a time, of all robots
 MESSAGE_MAX_BYTES: Final = 4 * MIB  # lerobot's clients send 2 MiB at most
+INSTRUCTIONS_MAX_BYTES: Final = 64 * 1024
 DETAILS_MAX_CHARS: Final = 1000  # they travel in a header
 _OPTIONS: Final = (
     ("grpc.max_receive_message_length", MESSAGE_MAX_BYTES),
@@ -75,10 +77,10 @@ _log = logging.getLogger("sidecars")
 
 
 @contextlib.asynccontextmanager
-async def served(path: Path, offers: Offers) -> AsyncIterator[None]:
-    """Serve at the unix socket `path` within the block."""
+async def served(path: Path, offers: Offers, conduct: Conduct) -> AsyncIterator[None]:
+    """Serve at the unix socket `path` within the block, and judge what comes for its `conduct`."""
     server = grpc.aio.server(options=_OPTIONS, maximum_concurrent_rpcs=REQUESTS_MAX)
-    server.add_generic_rpc_handlers((_handlers(_Door(offers)),))
+    server.add_generic_rpc_handlers((_handlers(_Door(offers, conduct), conduct),))
     server.add_insecure_port(f"unix:{path}")
     await server.start()
     try:
@@ -88,16 +90,21 @@ async def served(path: Path, offers: Offers) -> AsyncIterator[None]:
 
 
 class _Door:
-    def __init__(self, offers: Offers) -> None:
+    def __init__(self, offers: Offers, conduct: Conduct) -> None:
         self._offers = offers
+        self._conduct = conduct
         self._robots: dict[str, Robot] = {}  # by the name of their end
         self._messages = _messages()
 
     async def ready(self, request: Any, context: Any) -> Any:
+        await asyncio.sleep(BEGIN_S)
         return self._messages.Empty()
 
     async def instruct(self, request: Any, context: Any) -> Any:
         """Choose the skill that a robot asks for, and load it, as lerobot's server does."""
+        if len(request.data) > INSTRUCTIONS_MAX_BYTES:
+            raise LimitExceeded(f"instructions of more than {INSTRUCTIONS_MAX_BYTES} bytes")
+        await asyncio.sleep(BEGIN_S)
         asked = instructions_of(request.data)
         sidecar = await self._offers.find(asked.skill)
         await sidecar.load()
@@ -110,7 +117,7 @@ class _Door:
         """Forget robots whose connection has ended, which gRPC does not tell: the kernel lists the
         names of all ends."""
         ends = set(_ENDS.read_text(encoding="ascii", errors="replace").split())
-        gone = [peer for peer in self._robots if f"@{peer.rpartition(':')[2]}" not in ends]
+        gone = [peer for peer in self._robots if f"@{_end(peer)}" not in ends]
         for peer in gone:
             del self._robots[peer]
 
@@ -118,7 +125,9 @@ class _Door:
         robot = self._robot(context)
         try:
             async with asyncio.timeout(STREAM_S), robot.receiving:
-                robot.offer(observation_of(await _joined(chunks), robot.asked))
+                data = await _joined(chunks)
+                robot.offer(observation_of(data, robot.asked))
+                self._conduct.served(_end(context.peer()), len(data))
         except TimeoutError:
             raise LimitExceeded(
                 f"an observation that takes longer than {STREAM_S:g} s", hint="send less"
@@ -149,27 +158,34 @@ class _Door:
         return robot
 
 
+def _end(peer: str) -> str:
+    """Return the name of a connection's end, of gRPC's name of the peer."""
+    return peer.rpartition(":")[2]
+
+
 async def _joined(chunks: AsyncIterable[Any]) -> bytes:
     """Return the bytes of one observation. Raises BadRequest, LimitExceeded."""
-    data = bytearray()
+    parts: list[bytes] = []
+    left_bytes = IMAGES_MAX_BYTES
     try:
         async for chunk in chunks:
             if chunk.transfer_state == _BEGIN:
-                data.clear()
-            data += chunk.data
-            if len(data) > IMAGES_MAX_BYTES:
+                parts.clear()
+            parts.append(chunk.data)
+            left_bytes -= len(parts[-1])
+            if left_bytes < 0 or len(parts) > CHUNKS_MAX:
                 raise LimitExceeded(
-                    f"an observation of more than {IMAGES_MAX_BYTES} bytes",
+                    f"an observation of more than {IMAGES_MAX_BYTES} bytes or {CHUNKS_MAX} chunks",
                     hint="send smaller pictures",
                 )
             if chunk.transfer_state == _END:
-                return bytes(data)
+                return b"".join(parts)
     finally:
-        data.clear()  # a refusal's traceback would hold it until the collector runs
+        parts.clear()  # a refusal's traceback would hold them until the collector runs
     raise BadRequest("an observation without its end", hint="send what robot_client sends")
 
 
-def _handlers(door: _Door) -> Any:
+def _handlers(door: _Door, conduct: Conduct) -> Any:
     unary, stream = grpc.unary_unary_rpc_method_handler, grpc.stream_unary_rpc_method_handler
     known = _messages()
     methods = {
@@ -181,13 +197,15 @@ def _handlers(door: _Door) -> Any:
     return grpc.method_handlers_generic_handler(
         SERVICE,
         {
-            name: make(_told(answer, reply), request.FromString, reply.SerializeToString)
+            name: make(_told(answer, reply, conduct), request.FromString, reply.SerializeToString)
             for name, (make, answer, request, reply) in methods.items()
         },
     )
 
 
-def _told(answer: Callable[..., Any], reply: Callable[[], Any]) -> Callable[..., Any]:
+def _told(
+    answer: Callable[..., Any], reply: Callable[[], Any], conduct: Conduct
+) -> Callable[..., Any]:
     """Return a handler whose typed errors are statuses, with an empty `reply`."""
 
     async def answered(request: Any, context: Any) -> Any:
@@ -196,8 +214,8 @@ def _told(answer: Callable[..., Any], reply: Callable[[], Any]) -> Callable[...,
         except VramError as error:  # its traceback holds what was sent: only words are kept
             status = _STATUSES.get(type(error), grpc.StatusCode.ABORTED)
             details = f"{error.code}: {error}"[:DETAILS_MAX_CHARS]
-            wait_s = REFUSED_S if isinstance(error, CallerError) else 0.0
-        await asyncio.sleep(wait_s)
+            if isinstance(error, CallerError):
+                conduct.refused(_end(context.peer()))
         context.set_code(status)  # `abort` would keep the request until the collector runs
         context.set_details(details)
         return reply()

@@ -18,7 +18,7 @@ from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.heap import give_back_freed_memory
-from vram_arbiter.sidecars.port import on_port
+from vram_arbiter.sidecars.port import Conduct, on_port
 
 type Protocol = Literal["lerobot", "openpi"]
 PACKAGES: Final = {"lerobot": ("grpc", "google.protobuf", "lerobot"), "openpi": ("aiohttp",)}
@@ -91,20 +91,20 @@ async def opened(
     give_back_freed_memory()
     path = path_of(endpoint).with_suffix(f".{door.protocol}")
     path.unlink(missing_ok=True)  # of a process that was killed: the endpoint is ours alone
-    offers = Offers((endpoint, *door.offered), timeout_s)
+    offers, conduct = Offers((endpoint, *door.offered), timeout_s), Conduct()
     async with contextlib.AsyncExitStack() as stack:
         stack.callback(path.unlink, missing_ok=True)
         stack.push_async_callback(offers.close)
         if door.protocol == "lerobot":
             from vram_arbiter.sidecars.doors import lerobot_async
 
-            await stack.enter_async_context(lerobot_async.served(path, offers))
+            await stack.enter_async_context(lerobot_async.served(path, offers, conduct))
         else:
             from vram_arbiter.sidecars.doors import openpi
 
             await stack.enter_async_context(
-                openpi.served(path, offers.clients[0], manifest, door.keys)
+                openpi.served(path, offers.clients[0], manifest, door.keys, conduct)
             )
         path.chmod(0o660)
-        await stack.enter_async_context(on_port(door.port, path, CONNECTIONS_MAX))
+        await stack.enter_async_context(on_port(door.port, path, CONNECTIONS_MAX, conduct))
         yield

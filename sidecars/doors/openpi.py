@@ -22,15 +22,18 @@ from aiohttp import web
 from vram_arbiter.clients.net.server import IMAGES_MAX_BYTES
 from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.clients.sidecar.policy import PolicyClient
-from vram_arbiter.schemas.errors import BadFrame, BadRequest, InternalError, VramError
+from vram_arbiter.schemas.errors import BadFrame, BadRequest, CallerError, InternalError, VramError
 from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, unpack_map
 from vram_arbiter.sidecars.doors.offers import FRESH_S
+from vram_arbiter.sidecars.port import Conduct
 
 STATE_ORDER: Final = "openpi_state"
 """Key of `policy_extras`: the names of the vectors that make up the state, in order."""
-_LIMITS: Final = UnpackLimits(IMAGES_MAX_BYTES)
+_LIMITS: Final = UnpackLimits(IMAGES_MAX_BYTES, values_max=1000, beside_binary_max_bytes=1 << 16)
+"""An array has nine values."""
+STATE_MAX: Final = 4096  # numbers of one vector: a picture's as a state are 700 ms of one core
 _STATE, _IMAGES, _TASK = "observation.state", "observation.images.", "task"
 _TEXTS: Final = ("prompt", "task")
 _REASON_MAX_BYTES: Final = 123  # of a websocket's close
@@ -39,10 +42,15 @@ _log = logging.getLogger("sidecars")
 
 @contextlib.asynccontextmanager
 async def served(
-    path: Path, sidecar: PolicyClient, manifest: RSkillManifest, keys: Sequence[bytes]
+    path: Path,
+    sidecar: PolicyClient,
+    manifest: RSkillManifest,
+    keys: Sequence[bytes],
+    conduct: Conduct,
 ) -> AsyncIterator[None]:
-    """Serve at the unix socket `path` within the block. `keys`: empty lets in clients without."""
-    door = _Door(sidecar, manifest, keys)
+    """Serve at the unix socket `path` within the block, and judge what comes for its `conduct`.
+    `keys`: empty lets in clients without."""
+    door = _Door(sidecar, manifest, keys, conduct)
     app = web.Application()
     app.add_routes([web.get("/healthz", _health), web.get("/{path:.*}", door.connect)])
     runner = web.AppRunner(app, handle_signals=False, access_log=None, shutdown_timeout=0.1)
@@ -60,11 +68,16 @@ async def _health(request: web.Request) -> web.Response:
 
 class _Door:
     def __init__(
-        self, sidecar: PolicyClient, manifest: RSkillManifest, keys: Sequence[bytes]
+        self,
+        sidecar: PolicyClient,
+        manifest: RSkillManifest,
+        keys: Sequence[bytes],
+        conduct: Conduct,
     ) -> None:
         self._sidecar = sidecar
         self._manifest = manifest
         self._keys = keys
+        self._conduct = conduct
 
     async def connect(self, request: web.Request) -> web.StreamResponse:
         """Serve one client until it hangs up."""
@@ -80,13 +93,14 @@ class _Door:
         """Read all the time, which answers pings: a client that has no answer to them hangs up."""
         socket = web.WebSocketResponse(compress=False, max_msg_size=IMAGES_MAX_BYTES)
         await socket.prepare(request)
+        end = request.get_extra_info("peername").decode().lstrip("\0")
         work = asyncio.create_task(self._greet(socket), name="greet")
         try:
             async for message in socket:
                 if not work.done():
                     await socket.close(code=1008, message=b"one observation at a time")
                     break
-                work = asyncio.create_task(self._answer(socket, message), name="infer")
+                work = asyncio.create_task(self._answer(socket, message, end), name="infer")
         finally:
             work.cancel()
             await asyncio.gather(work, return_exceptions=True)
@@ -101,10 +115,16 @@ class _Door:
             reason = f"{error.code}: {error.message}".encode()[:_REASON_MAX_BYTES]
             await socket.close(code=1013, message=reason.decode(errors="ignore").encode())
 
-    async def _answer(self, socket: web.WebSocketResponse, message: aiohttp.WSMessage) -> None:
+    async def _answer(
+        self, socket: web.WebSocketResponse, message: aiohttp.WSMessage, end: str
+    ) -> None:
         try:
-            await socket.send_bytes(await self._infer(message))
+            answer = await self._infer(message)
+            self._conduct.served(end, len(message.data))
+            await socket.send_bytes(answer)
         except VramError as error:
+            if isinstance(error, CallerError):
+                self._conduct.refused(end)
             await socket.send_str(f"{error.code}: {error}")
         except ConnectionError:
             pass  # it has hung up
@@ -171,6 +191,10 @@ def _state(vectors: Mapping[str, Any], order: Any) -> Any:
         raise BadRequest(
             f"the observation has no {' and no '.join(lacking)}; its vectors are {list(vectors)}",
             hint=f"name those that make up the state in policy_extras.{STATE_ORDER}",
+        )
+    if long := [name for name in names if getattr(vectors[name], "size", 0) > STATE_MAX]:
+        raise BadRequest(
+            f"{long[0]} has more than {STATE_MAX} numbers", hint="pictures have 3 dimensions"
         )
     try:
         return numpy.concatenate([numpy.ravel(numpy.float32(vectors[name])) for name in names])

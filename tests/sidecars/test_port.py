@@ -13,7 +13,15 @@ import pytest
 
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.ports import free_port
-from vram_arbiter.sidecars.port import CONNECTIONS_MAX, _pass_on, on_port
+from vram_arbiter.sidecars.port import (
+    CONNECTIONS_MAX,
+    FREE_BYTES,
+    REFUSED_S,
+    UNPROVEN_BYTES_PER_S,
+    Conduct,
+    _pass_on,
+    on_port,
+)
 
 BYTES = bytes(range(256)) * 4096  # more than one read
 
@@ -93,6 +101,46 @@ def test_a_cancellation_at_any_moment_closes_the_inner_connection(tmp_path):
         asyncio.run(story())
     finally:
         gc.enable()
+
+
+def test_bytes_that_no_request_makes_good_wait_and_others_do_not():
+    """Fourteen hostile clients kept three quarters of a core busy, and robots waiting."""
+    now = [100.0]
+    conduct = Conduct(lambda: now[0])
+    second = UNPROVEN_BYTES_PER_S
+    with conduct.connected("honest"):
+        with conduct.connected("hostile"), conduct.connected("another"):
+            for end in ("hostile", "another"):
+                assert conduct.came(end, FREE_BYTES) == 0.0
+            assert [conduct.came(end, second) for end in ("hostile", "another")] == [1.0, 2.0]
+            for _ in range(100):
+                assert conduct.came("honest", FREE_BYTES - 1024) == 0.0, "its requests are served"
+                conduct.served("honest", FREE_BYTES - 1024)
+            conduct.served("hostile", 10)
+            assert conduct.came("hostile", second) == 3.0, "a small one makes little good"
+        assert conduct.debt_s() == 3.0 + 2 * FREE_BYTES / second, "hanging up is no way out"
+    now[0] += conduct.debt_s()
+    assert conduct.debt_s() == 0.0
+
+
+def test_a_client_is_allowed_requests_as_large_as_those_that_were_served():
+    conduct = Conduct(lambda: 0.0)
+    with conduct.connected("robot"):
+        assert conduct.came("robot", 2 * FREE_BYTES) > 0.0
+        conduct.served("robot", 2 * FREE_BYTES)
+        assert conduct.came("robot", 2 * FREE_BYTES) == 0.0
+
+
+def test_after_a_refusal_a_connection_is_not_read():
+    now = [0.0]
+    conduct = Conduct(lambda: now[0])
+    with conduct.connected("hostile"), conduct.connected("honest"):
+        conduct.refused("hostile")
+        assert (conduct.came("hostile", 1), conduct.came("honest", 1)) == (REFUSED_S, 0.0)
+        now[0] = REFUSED_S
+        assert conduct.came("hostile", 1) == 0.0
+    conduct.refused("hostile")  # one that has hung up
+    conduct.served("hostile", 1)
 
 
 AS_USER = """
