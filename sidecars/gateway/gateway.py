@@ -1,6 +1,7 @@
 """The gateway: its parts joined, from the first contact with the arbiter to SIGTERM."""
 
 import asyncio
+import gc
 import logging
 import resource
 import signal
@@ -15,10 +16,10 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.config.gateway import GatewayConfig
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.urls import HttpAddress, http_address
-from vram_arbiter.sidecars.gateway import proxy
 from vram_arbiter.sidecars.gateway.front import Front
 from vram_arbiter.sidecars.gateway.keys import Keys, private_text, read_keys
 from vram_arbiter.sidecars.gateway.server import Server
+from vram_arbiter.sidecars.gateway.upstream import HIGH_BYTES
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +45,7 @@ class Listener(web.Server):
             max_field_size=limits.header_max_bytes,
             max_headers=HEADERS_MAX,
             auto_decompress=False,
-            read_bufsize=proxy.CHUNK_BYTES,
+            read_bufsize=HIGH_BYTES,
             access_log=None,
         )
         self._per_peer = limits.connections_per_peer
@@ -96,13 +97,13 @@ async def run(config: GatewayConfig, endpoint: str | None) -> None:
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    async with AsyncClient(NAME, endpoint=endpoint) as client, proxy.new_session() as session:
+    async with AsyncClient(NAME, endpoint=endpoint) as client:
         servers = {
             name: Server(name, server, client, keys.reserved(name))
             for name, server in config.servers.items()
         }
         wanted = http_address(config.listen)
-        front = Front(config, wanted, servers, keys, session, upstream_keys)
+        front = Front(config, wanted, servers, keys, upstream_keys)
         listener = Listener(front, config)
         try:
             listening = await loop.create_server(
@@ -113,6 +114,7 @@ async def run(config: GatewayConfig, endpoint: str | None) -> None:
                 f"{wanted} cannot be listened on: {error.strerror}", hint="choose another address"
             ) from error
         port = listening.sockets[0].getsockname()[1]
+        gc.freeze()  # modules stay: no collection, which delays all requests, looks at them again
         print(f"http://{HttpAddress(wanted.host, port)}", flush=True)
         try:
             await stop.wait()
