@@ -36,6 +36,8 @@ from vram_arbiter.sidecars.gateway.server import Server, Turn
 OWNER: Final = "vram-gateway"
 UPSTREAM: Final = "/upstream/"
 CONNECT_TRIES: Final = 10
+LOOK_BYTES: Final = 4096
+"""Of a body, looked through at a time."""
 SHOWN_AS: Final = {"away": "stopped", "queued": "starting", "leaving": "stopping"}
 """llama-swap's word of a state, where it has another one."""
 
@@ -145,11 +147,12 @@ class Front:
         kind = request.headers.get("content-type", "")
         finder = finder_of(kind, streams=self._config.keep_alive_s is not None)
         reply.ask_for_body()
-        done = False
-        while not done and (data := await proxy.read_some(request, self._config.limits.head_s)):
+        done, head_s = False, self._config.limits.head_s
+        while not done and (data := await proxy.read_some(request, head_s, LOOK_BYTES)):
             hold(len(data))
             body += data
             done = finder.feed(data)
+            await asyncio.sleep(0)  # others go on: a piece takes some milliseconds at worst
         if finder.model is None:
             raise no_model()
         return finder.model, finder.stream

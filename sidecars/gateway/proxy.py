@@ -28,6 +28,8 @@ from vram_arbiter.sidecars.gateway.upstream import (
 WS_QUIET_S: Final = 5.0
 WS_GOING_AWAY: Final = b"\x88\x02\x03\xe9"
 """A close frame with 1001 (RFC 6455, 7.4.1)."""
+WS_HEAD_MAX_BYTES: Final = 14
+WS_PIECE_BYTES: Final = 1 << 14
 HOP_BY_HOP: Final = frozenset(
     (b"connection", b"keep-alive", b"proxy-authenticate", b"proxy-authorization",
      b"proxy-connection", b"te", b"trailer", b"transfer-encoding", b"upgrade")
@@ -79,14 +81,16 @@ def _head(start: bytes, fields: Iterable[Field]) -> bytes:
     return b"\r\n".join(lines) + b"\r\n\r\n"
 
 
-async def read_some(request: web.BaseRequest, silence_s: float) -> bytes:
+async def read_some(
+    request: web.BaseRequest, silence_s: float, most_bytes: int = HIGH_BYTES
+) -> bytes:
     """Return what came of a body, b"" at its end. Raises BadRequest for one that is broken, or
     silent."""
     try:
-        if data := request.content.read_nowait():
+        if data := request.content.read_nowait(most_bytes):
             return data
         async with asyncio.timeout(silence_s):
-            return await request.content.readany()
+            return await request.content.read(most_bytes)
     except TimeoutError:
         raise BadRequest(f"nothing of the body came for {silence_s:g} s") from None
     except web.RequestPayloadError as error:
@@ -226,10 +230,13 @@ async def _one_way(
     drain: Callable[[], Awaitable[None]],
 ) -> None:
     while data := await read():
-        if frames.message_in(data):
-            await bursts.message()
-        write(data)
-        await drain()
+        for at in range(0, len(data), WS_PIECE_BYTES):
+            piece = data[at : at + WS_PIECE_BYTES]
+            if frames.message_in(piece):
+                await bursts.message()
+            write(piece)
+            await drain()
+            await asyncio.sleep(0)  # others go on: thousands of frames may be in a piece
 
 
 class _Incoming:
@@ -260,26 +267,29 @@ class _Frames:
         """Return whether bytes of a message are among these."""
         at, found = 0, False
         while at < len(data):
-            if self._left:
-                passed = min(self._left, len(data) - at)
-                self._left -= passed
-                at += passed
-            else:
-                self._head += data[at : at + 1]
-                at += 1
-                self._read_head()
+            if not self._left:
+                head = self._head + data[at : at + WS_HEAD_MAX_BYTES]
+                size, self._left = _sizes(head)
+                at += min(size, len(head)) - len(self._head)
+                self._head = head if len(head) < size else b""
+                self._is_message = not head[0] & 0x08
             found = found or self._is_message
+            passed = min(self._left, len(data) - at)
+            self._left -= passed
+            at += passed
         return found
 
-    def _read_head(self) -> None:
-        self._is_message = not self._head[0] & 0x08
-        if len(self._head) < 2:
-            return
-        length, masked = self._head[1] & 0x7F, self._head[1] >> 7
-        wide = {126: 2, 127: 8}.get(length, 0)
-        if len(self._head) == 2 + wide + 4 * masked:
-            self._left = int.from_bytes(self._head[2 : 2 + wide]) if wide else length
-            self._head = b""
+
+def _sizes(head: bytes) -> tuple[int, int]:
+    """Return the bytes of a frame's head, and of its payload, 0 unless the head is whole."""
+    if len(head) < 2:
+        return 2, 0
+    length, masked = head[1] & 0x7F, head[1] >> 7
+    wide = {126: 2, 127: 8}.get(length, 0)
+    size = 2 + wide + 4 * masked
+    if wide:
+        length = int.from_bytes(head[2 : 2 + wide])
+    return size, length if len(head) >= size else 0
 
 
 class _Bursts:
