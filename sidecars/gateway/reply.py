@@ -111,6 +111,8 @@ class Reply:
         return Sent(lasts=False)
 
     def _comment(self) -> None:
+        if self.request.transport is None:  # the client is just leaving
+            return
         self.transport.write(b": waiting\n\n" if self.streams else _STREAM + b": waiting\n\n")
         self.streams = True
         self.wait()

@@ -235,6 +235,7 @@ class Connection(asyncio.Protocol):
                 await self._changed.wait()
         finally:
             self._sink = None
+            self._transport.resume_reading()  # for the next request
         if self._ended is not None and not body.over and body.bounded:
             raise self._ended
 

@@ -1,5 +1,6 @@
 """Where an answer's head and body end, and what of a WebSocket is a message."""
 
+import asyncio
 import math
 
 import pytest
@@ -8,7 +9,7 @@ pytest.importorskip("aiohttp", reason="the extra `gateway`")
 
 from vram_arbiter.schemas.errors import SidecarUnavailable
 from vram_arbiter.sidecars.gateway.proxy import _Frames, end_to_end
-from vram_arbiter.sidecars.gateway.upstream import Chunked, Counted, Head, read_head
+from vram_arbiter.sidecars.gateway.upstream import Chunked, Connection, Counted, Head, read_head
 
 CHUNKED = b"5\r\nhello\r\n1;a=b\r\n\n\r\n00A\r\n0123456789\r\n0\r\nTrailer: x\r\n\r\n"
 
@@ -107,3 +108,50 @@ def test_pings_of_a_websocket_are_not_messages(size: int) -> None:
         assert all(frames.message_in(piece) for piece in pieces(long, size))
         assert all(frames.message_in(piece) for piece in pieces(huge, size))
         assert frames.between
+
+
+class Pipe(asyncio.Transport):
+    """A transport that keeps what is written, and whether it may be read."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.written, self.reads = b"", True
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        self.written += bytes(data)
+
+    def get_write_buffer_size(self) -> int:
+        return len(self.written)
+
+    def is_closing(self) -> bool:
+        return False
+
+    def pause_reading(self) -> None:
+        self.reads = False
+
+    def resume_reading(self) -> None:
+        self.reads = True
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("late", [False, True], ids=["with its head", "later"])
+async def test_a_connection_is_read_again_after_a_large_answer(late: bool) -> None:
+    """Regression: the next request of a kept connection never saw its answer."""
+    server, client, connection = Pipe(), Pipe(), Connection()
+    connection.connection_made(server)
+    data = b"HTTP/1.1 200 OK\r\nContent-Length: 100000\r\n\r\n" + bytes(100_000)
+    connection.data_received(data[: 1000 if late else None])
+    found = await connection.head()
+    body = found.body("GET", decoded=False)
+    passing = asyncio.create_task(connection.pass_body(b"", body, client, drained))
+    await asyncio.sleep(0)
+    if late:
+        connection.data_received(data[1000:])
+    await passing
+    assert len(client.written) == 100_000
+    assert connection.usable
+    assert server.reads
+
+
+async def drained() -> None:
+    pass
