@@ -1,34 +1,27 @@
-"""What clients see: endpoints, who may use what, limits, and errors as OpenAI's clients read them.
+"""What clients see: endpoints, who may use what, and limits.
 
 Paths of llama-swap answer as there; `/upstream/NAME/…` goes to that server as it stands; any other
 path goes to the server of the body's `model`, or to the only server.
 """
 
 import asyncio
-import json
-import logging
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Final
 from urllib.parse import unquote
 
-from aiohttp import ClientSession, web
+from aiohttp import web
 
 from vram_arbiter.clients.observer.page.access import Access
 from vram_arbiter.schemas.config.gateway import GatewayConfig
 from vram_arbiter.schemas.errors import (
-    ArbiterUnreachable,
     BadRequest,
-    Evicted,
-    KeyRefused,
     LimitExceeded,
     MessageTooLarge,
     NotPermitted,
-    SidecarUnavailable,
     UnknownModel,
     VramError,
-    WaitTimeout,
 )
 from vram_arbiter.schemas.runtime.telemetry import meters
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
@@ -36,29 +29,15 @@ from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.urls import HttpAddress
 from vram_arbiter.sidecars.gateway import proxy
 from vram_arbiter.sidecars.gateway.keys import Asker, Keys
+from vram_arbiter.sidecars.gateway.reply import Reply, Sent, failure
 from vram_arbiter.sidecars.gateway.routing import finder_of, no_model
 from vram_arbiter.sidecars.gateway.server import Server, Turn
 
-log = logging.getLogger(__name__)
-
 OWNER: Final = "vram-gateway"
 UPSTREAM: Final = "/upstream/"
-RETRY_AFTER_S: Final = 5
 CONNECT_TRIES: Final = 10
-STATUS: Final[Mapping[type[VramError], int]] = {
-    KeyRefused: 401,
-    NotPermitted: 403,
-    UnknownModel: 404,
-    MessageTooLarge: 413,
-    BadRequest: 400,
-    LimitExceeded: 503,
-    WaitTimeout: 503,
-    Evicted: 503,
-    ArbiterUnreachable: 503,
-    SidecarUnavailable: 502,
-}
-RETRIED: Final = 503
-"""Sent with Retry-After."""
+LOOK_BYTES: Final = 4096
+"""Of a body, looked through at a time."""
 SHOWN_AS: Final = {"away": "stopped", "queued": "starting", "leaving": "stopping"}
 """llama-swap's word of a state, where it has another one."""
 
@@ -75,11 +54,10 @@ class Front:
         address: HttpAddress,
         servers: Mapping[str, Server],
         keys: Keys,
-        session: ClientSession,
         upstream_keys: Mapping[str, str],
     ) -> None:
         self._config, self._servers, self._keys = config, servers, keys
-        self._session, self._upstream_keys = session, upstream_keys
+        self._upstream_keys = upstream_keys
         self._access = None if keys else Access(address, (), None)
         self._by_model = {
             model: server
@@ -110,10 +88,7 @@ class Front:
     def _asker(self, request: web.BaseRequest) -> Asker:
         """Raises KeyRefused, NotPermitted."""
         if self._access is not None:
-            headers = {
-                name.lower().encode(): value.encode(errors="replace")
-                for name, value in request.headers.items()
-            }
+            headers = {name.lower(): value for name, value in request.raw_headers}
             if (denied := self._access.check(headers)) is not None:
                 raise NotPermitted(
                     f"this request is refused: {denied.text}",
@@ -140,49 +115,44 @@ class Front:
 
     # -- requests for a server
     async def _serve(self, request: web.BaseRequest, asker: Asker) -> web.StreamResponse:
+        target = request.raw_path
+        if not target.startswith("/"):
+            raise BadRequest(f"expected a path, got {target[:80]!r}")
         if request.path.startswith(UPSTREAM):
-            name, slash, rest = request.raw_path.removeprefix(UPSTREAM).partition("/")
+            name, slash, rest = target.removeprefix(UPSTREAM).partition("/")
             server = self._server_of(unquote(name.partition("?")[0]), asker)
-            return await self._pass_on(request, asker, server, slash + rest or "/", b"")
+            return await self._pass_on(Reply(request, None), asker, server, slash + rest or "/")
         if len(self._servers) == 1:
             (server,) = self._visible(asker) or [self._server_of("", asker)]
-            return await self._pass_on(request, asker, server, request.raw_path, b"")
+            return await self._pass_on(Reply(request, None), asker, server, target)
         body = bytearray()
         async with self._holding(request) as hold:
-            model, stream = await self._read_model(request, body, hold)
+            reply = Reply(request, self._config.keep_alive_s)
+            model, stream = await self._read_model(reply, body, hold)
             server = self._server_of(model, asker)
             return await self._pass_on(
-                request, asker, server, request.raw_path, bytes(body), stream=stream
+                reply if stream else Reply(request, None), asker, server, target, bytes(body)
             )
 
     async def _read_model(
-        self, request: web.BaseRequest, body: bytearray, hold: Callable[[int], None]
+        self, reply: Reply, body: bytearray, hold: Callable[[int], None]
     ) -> tuple[str, bool]:
         """Read the body into `body` until its model is known. Return it, and whether the answer is
         a stream. Raises BadRequest, MessageTooLarge, LimitExceeded."""
+        request = reply.request
         if not request.body_exists:
             raise UnknownModel(f"nothing is served at {request.path}", hint="see /v1/models")
         if request.headers.get("content-encoding", "identity") != "identity":
             raise BadRequest("a compressed body cannot be routed", hint="use /upstream/NAME/…")
         kind = request.headers.get("content-type", "")
         finder = finder_of(kind, streams=self._config.keep_alive_s is not None)
-        await _continue(request)
-        try:
-            async with asyncio.timeout(None) as limit:
-                done = False
-                while not done:
-                    now = asyncio.get_running_loop().time()
-                    limit.reschedule(now + self._config.limits.head_s)
-                    data = await request.content.readany()
-                    if not data:
-                        break
-                    hold(len(data))
-                    body += data
-                    done = finder.feed(data)
-        except TimeoutError:
-            raise BadRequest(
-                f"nothing of the body came for {self._config.limits.head_s:g} s"
-            ) from None
+        reply.ask_for_body()
+        done, head_s = False, self._config.limits.head_s
+        while not done and (data := await proxy.read_some(request, head_s, LOOK_BYTES)):
+            hold(len(data))
+            body += data
+            done = finder.feed(data)
+            await asyncio.sleep(0)  # others go on: a piece takes some milliseconds at worst
         if finder.model is None:
             raise no_model()
         return finder.model, finder.stream
@@ -214,52 +184,41 @@ class Front:
             self._held_bytes -= held
 
     async def _pass_on(
-        self,
-        request: web.BaseRequest,
-        asker: Asker,
-        server: Server,
-        target: str,
-        begun: bytes,
-        *,
-        stream: bool = False,
+        self, reply: Reply, asker: Asker, server: Server, target: str, begun: bytes = b""
     ) -> web.StreamResponse:
-        """Wait for the server, and let it answer."""
-        headers = proxy.upstream_headers(
-            request,
+        """Wait for the server, and let it answer. `begun`: what was read of the body."""
+        fields = proxy.upstream_fields(
+            reply.request,
             checked=bool(self._keys),
             upstream_key=self._upstream_keys.get(server.name),
         )
-        if request.headers.get("upgrade", "").lower() == "websocket":
-            return await proxy.tunnel(
-                self._session, request, target, headers, lambda: self._turn(request, server, asker)
-            )
-        early = KeepAlive(request, self._config.keep_alive_s if stream else None)
-        try:
-            tries = CONNECT_TRIES
-            while True:
-                try:
-                    async with early.while_waiting(), self._turn(request, server, asker) as turn:
-                        await early.stop()
-                        await _continue(request)
-                        return await proxy.forward(
-                            self._session,
-                            request,
-                            turn.url + target,
-                            headers,
-                            begun,
-                            early.response,
-                        )
-                except proxy.Unreached:
-                    tries -= 1
-                    if not tries:
-                        raise
-                    server.refused()
-        except VramError as error:
-            if early.response is not None:
-                return await early.fail(error)
-            if request.writer.output_size:  # a part of the answer is sent: it cannot be taken back
-                raise ConnectionAbortedError(str(error)) from error
-            raise
+
+        def turn() -> AbstractAsyncContextManager[Turn]:
+            return self._turn(reply.request, server, asker)
+
+        tries = CONNECT_TRIES
+        while True:
+            try:
+                reply.wait()
+                async with turn() as current:
+                    reply.go()
+                    reply.ask_for_body()
+                    silence_s = self._config.limits.head_s
+                    upgraded = await proxy.forward(
+                        current.upstream, reply, target, fields, begun, silence_s
+                    )
+                if upgraded is not None:
+                    await proxy.tunnel(reply, upgraded, turn)
+                return Sent(lasts=reply.lasts)
+            except proxy.Unreached as error:
+                tries -= 1
+                if not tries:
+                    return reply.fail(error)
+                server.refused()
+            except VramError as error:
+                return reply.fail(error)
+            finally:
+                reply.go()
 
     @asynccontextmanager
     async def _turn(
@@ -319,81 +278,3 @@ class Front:
         """Return the servers that `?model=` names, or all. Raises UnknownModel."""
         model = request.query.get("model")
         return self._visible(asker) if model is None else [self._server_of(model, asker)]
-
-
-class KeepAlive:
-    """Comments of an event stream (`: waiting`) while a request waits. `response`: None until one
-    was sent."""
-
-    def __init__(self, request: web.BaseRequest, every_s: float | None) -> None:
-        self._request, self._every_s = request, every_s
-        self._task: asyncio.Task[None] | None = None
-        self.response: web.StreamResponse | None = None
-
-    @asynccontextmanager
-    async def while_waiting(self) -> AsyncIterator[None]:
-        """Send comments until `stop`."""
-        if self._every_s is not None:
-            self._task = asyncio.create_task(self._send(self._every_s))
-        try:
-            yield
-        finally:
-            await self.stop()
-
-    async def stop(self) -> None:
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
-            self._task = None
-
-    async def fail(self, error: VramError) -> web.StreamResponse:
-        """End the stream with an event that says why."""
-        assert self.response is not None
-        event = f"event: error\ndata: {json.dumps(_body(error))}\n\n"
-        await self.response.write(event.encode())
-        await self.response.write_eof()
-        return self.response
-
-    async def _send(self, every_s: float) -> None:
-        while True:
-            await asyncio.sleep(every_s)
-            if self.response is None:
-                headers = {"Content-Type": "text/event-stream", "Cache-Control": "no-cache"}
-                self.response = web.StreamResponse(headers=headers)
-                await self.response.prepare(self._request)
-            await self.response.write(b": waiting\n\n")
-
-
-def failure(error: VramError) -> web.Response:
-    """Return the answer that says an error."""
-    status = next((code for kind, code in STATUS.items() if isinstance(error, kind)), 500)
-    headers = {}
-    if status == RETRIED:
-        headers["Retry-After"] = str(RETRY_AFTER_S)
-    elif status == 401:
-        headers["WWW-Authenticate"] = "Bearer"
-    response = web.json_response(_body(error), status=status, headers=headers)
-    if status in (401, 413):  # of a body nothing more is read
-        response.force_close()
-    return response
-
-
-def _body(error: VramError) -> dict[str, object]:
-    """Return an error as OpenAI's clients read it; Anthropic's read `type` as well."""
-    said = {
-        "message": str(error),
-        "type": error.code,
-        "code": error.code,
-        "param": None,
-        **error.details,
-    }
-    return {"type": "error", "error": said}
-
-
-async def _continue(request: web.BaseRequest) -> None:
-    """Let a client send its body that waits for permission (RFC 9110, 10.1.1), once."""
-    waits = request.headers.get("expect", "").lower() == "100-continue"
-    if waits and not request.content.is_eof() and not request.get("continued"):
-        request["continued"] = True
-        await request.writer.write(b"HTTP/1.1 100 Continue\r\n\r\n")
-        request.writer.output_size = 0

@@ -1,34 +1,59 @@
 """The gateway: its parts joined, from the first contact with the arbiter to SIGTERM."""
 
 import asyncio
+import gc
 import logging
 import resource
 import signal
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from aiohttp import web
 from aiohttp.web_protocol import RequestHandler
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.config.gateway import GatewayConfig
-from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.errors import BadRequest, ConfigError
 from vram_arbiter.schemas.urls import HttpAddress, http_address
-from vram_arbiter.sidecars.gateway import proxy
 from vram_arbiter.sidecars.gateway.front import Front
 from vram_arbiter.sidecars.gateway.keys import Keys, private_text, read_keys
+from vram_arbiter.sidecars.gateway.reply import failure
 from vram_arbiter.sidecars.gateway.server import Server
+from vram_arbiter.sidecars.gateway.upstream import HIGH_BYTES
 
 log = logging.getLogger(__name__)
 
 NAME: Final = "vram-gateway"
 BACKLOG: Final = 1024
 HEADERS_MAX: Final = 128
+TOLD_MAX: Final = 200
+"""Characters of what is wrong with a head."""
 OPEN_FILES: Final = 65_536
 """A request takes two: the usual soft limit of 1,024 is too few for 1,000 clients that wait."""
 SHUTDOWN_S: Final = 0.1
 """For answers that are almost sent; 0 would be no limit."""
+
+
+class _Handler(RequestHandler):
+    """A connection. Errors are told as all others, and what a client got wrong is not logged."""
+
+    __slots__ = ()
+
+    def handle_error(
+        self,
+        request: web.BaseRequest,
+        status: int = 500,
+        exc: BaseException | None = None,
+        message: str | None = None,
+    ) -> web.StreamResponse:
+        if status >= 500:
+            return super().handle_error(request, status, exc, message)
+        why = (message or "").partition("\n")[0][:TOLD_MAX]
+        response = failure(BadRequest(f"the request cannot be read: {why}"))
+        response.force_close()
+        return response
 
 
 class Listener(web.Server):
@@ -36,20 +61,22 @@ class Listener(web.Server):
 
     def __init__(self, front: Front, config: GatewayConfig) -> None:
         limits = config.limits
-        super().__init__(
-            front.handle,
-            handler_cancellation=True,
-            keepalive_timeout=limits.head_s,
-            max_line_size=limits.header_max_bytes,
-            max_field_size=limits.header_max_bytes,
-            max_headers=HEADERS_MAX,
-            auto_decompress=False,
-            read_bufsize=proxy.CHUNK_BYTES,
-            access_log=None,
-        )
+        super().__init__(front.handle, handler_cancellation=True)
+        self._options: Mapping[str, Any] = {
+            "keepalive_timeout": limits.head_s,
+            "max_line_size": limits.header_max_bytes,
+            "max_field_size": limits.header_max_bytes,
+            "max_headers": HEADERS_MAX,
+            "auto_decompress": False,
+            "read_bufsize": HIGH_BYTES,
+            "access_log": None,
+        }
         self._per_peer = limits.connections_per_peer
         self._peers: Counter[str] = Counter()
         self._peer_of: dict[RequestHandler, str] = {}
+
+    def __call__(self) -> RequestHandler:
+        return _Handler(self, loop=asyncio.get_running_loop(), **self._options)
 
     def connection_made(self, handler: RequestHandler, transport: asyncio.Transport) -> None:
         super().connection_made(handler, transport)
@@ -96,13 +123,13 @@ async def run(config: GatewayConfig, endpoint: str | None) -> None:
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    async with AsyncClient(NAME, endpoint=endpoint) as client, proxy.new_session() as session:
+    async with AsyncClient(NAME, endpoint=endpoint) as client:
         servers = {
             name: Server(name, server, client, keys.reserved(name))
             for name, server in config.servers.items()
         }
         wanted = http_address(config.listen)
-        front = Front(config, wanted, servers, keys, session, upstream_keys)
+        front = Front(config, wanted, servers, keys, upstream_keys)
         listener = Listener(front, config)
         try:
             listening = await loop.create_server(
@@ -113,6 +140,7 @@ async def run(config: GatewayConfig, endpoint: str | None) -> None:
                 f"{wanted} cannot be listened on: {error.strerror}", hint="choose another address"
             ) from error
         port = listening.sockets[0].getsockname()[1]
+        gc.freeze()  # modules stay: no collection, which delays all requests, looks at them again
         print(f"http://{HttpAddress(wanted.host, port)}", flush=True)
         try:
             await stop.wait()

@@ -18,6 +18,7 @@ from vram_arbiter.schemas.config.gateway import ServerConfig
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.runtime.ports import free_port
 from vram_arbiter.schemas.runtime.printable import printable_lines
+from vram_arbiter.sidecars.gateway.upstream import Upstream
 
 LINES_MAX: Final = 1000
 LINE_MAX_BYTES: Final = 4096
@@ -47,7 +48,7 @@ class Program:
     the lease's."""
 
     def __init__(self, url: str, log: Log, changed: Callable[[], None]) -> None:
-        self.url = url
+        self.upstream = Upstream(url)
         self.state = "queued"
         self.lease_id, self.token, self.gpu = "", Token(0, 0), ""
         self.reason = ""

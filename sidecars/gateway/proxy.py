@@ -5,194 +5,291 @@ its server may have done its work.
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Final
 
-from aiohttp import (
-    ClientConnectionError,
-    ClientConnectorError,
-    ClientError,
-    ClientSession,
-    ClientTimeout,
-    ClientWebSocketResponse,
-    DummyCookieJar,
-    TCPConnector,
-    WSCloseCode,
-    WSMsgType,
-    web,
-)
-from multidict import CIMultiDict
-from yarl import URL
+from aiohttp import HttpVersion11, StreamReader, web
 
-from vram_arbiter.schemas.errors import SidecarUnavailable
+from vram_arbiter.schemas.errors import BadRequest, SidecarUnavailable, VramError
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
+from vram_arbiter.sidecars.gateway.reply import Reply
+from vram_arbiter.sidecars.gateway.upstream import (
+    HIGH_BYTES,
+    SWITCHING,
+    Connection,
+    Field,
+    Head,
+    Upstream,
+    malformed,
+)
 
-CONNECT_S: Final = 10.0
-KEPT_S: Final = 1.0
-"""A connection is used again within this time alone: servers close idle ones after 5 s and more,
-and a request that meets that fails."""
-CHUNK_BYTES: Final = 1 << 16
-WS_MESSAGE_MAX_BYTES: Final = 64 << 20
 WS_QUIET_S: Final = 5.0
-PASSED_CODES: Final = frozenset((*range(1000, 1004), *range(1007, 1015), *range(3000, 5000)))
-"""Codes of a close frame that may be sent (RFC 6455, 7.4)."""
+WS_GOING_AWAY: Final = b"\x88\x02\x03\xe9"
+"""A close frame with 1001 (RFC 6455, 7.4.1)."""
+WS_HEAD_MAX_BYTES: Final = 14
+WS_PIECE_BYTES: Final = 1 << 14
 HOP_BY_HOP: Final = frozenset(
-    ("connection", "keep-alive", "proxy-authenticate", "proxy-authorization", "proxy-connection",
-     "te", "trailer", "transfer-encoding", "upgrade")
+    (b"connection", b"keep-alive", b"proxy-authenticate", b"proxy-authorization",
+     b"proxy-connection", b"te", b"trailer", b"transfer-encoding", b"upgrade")
 )  # fmt: skip
-OWN: Final = frozenset(("host", "expect", "authorization", "x-api-key"))
-"""Headers that are between a client and the gateway; keys that are not checked here pass."""
-WS_OWN: Final = frozenset(
-    ("sec-websocket-key", "sec-websocket-version", "sec-websocket-extensions",
-     "sec-websocket-protocol", "sec-websocket-accept")
-)  # fmt: skip
+OWN: Final = frozenset((b"host", b"expect"))
+"""Headers that are between a client and the gateway."""
+KEYS: Final = frozenset((b"authorization", b"x-api-key"))
+"""As well, where they are checked here, or the server asks for a key of its own."""
 
 
 class Unreached(SidecarUnavailable):
     """The server took no connection, so that the request can be sent again."""
 
 
-def new_session() -> ClientSession:
-    """Return the session of all upstream connections: no limit, no waiting, nothing decoded."""
-    return ClientSession(
-        connector=TCPConnector(limit=0, keepalive_timeout=KEPT_S),
-        timeout=ClientTimeout(total=None, sock_connect=CONNECT_S),
-        auto_decompress=False,
-        skip_auto_headers=("user-agent", "accept", "accept-encoding", "content-type"),
-        read_bufsize=CHUNK_BYTES,
-        cookie_jar=DummyCookieJar(),
-    )
+def end_to_end(fields: Iterable[Field], without: frozenset[bytes]) -> list[Field]:
+    """Return the header fields that go to the next hop."""
+    dropped = HOP_BY_HOP | without
+    for name, value in fields:
+        if name.lower() == b"connection":
+            dropped |= {token.strip().lower() for token in value.split(b",")}
+    return [(name, value) for name, value in fields if name.lower() not in dropped]
 
 
-def end_to_end(headers: Iterable[tuple[str, str]], without: frozenset[str]) -> CIMultiDict[str]:
-    """Return the headers that go to the next hop."""
-    pairs = list(headers)
-    named = {
-        token.strip().lower()
-        for name, value in pairs
-        if name.lower() == "connection"
-        for token in value.split(",")
-    }
-    dropped = HOP_BY_HOP | without | named
-    return CIMultiDict((name, value) for name, value in pairs if name.lower() not in dropped)
-
-
-def upstream_headers(
+def upstream_fields(
     request: web.BaseRequest, *, checked: bool, upstream_key: str | None
-) -> CIMultiDict[str]:
+) -> list[Field]:
     """Return a request's headers for the server. `checked`: the gateway asks for keys, which are
     not the server's matter."""
-    own = OWN if checked or upstream_key else OWN - {"authorization", "x-api-key"}
-    headers = end_to_end(request.headers.items(), own)
+    fields = end_to_end(request.raw_headers, OWN | KEYS if checked or upstream_key else OWN)
     if upstream_key:
-        headers["Authorization"] = f"Bearer {upstream_key}"
-    return headers
+        fields.append((b"Authorization", b"Bearer " + upstream_key.encode()))
+    if is_websocket(request):
+        fields += [(b"Connection", b"Upgrade"), (b"Upgrade", b"websocket")]
+    if _chunked(request):
+        fields.append((b"Transfer-Encoding", b"chunked"))
+    return fields
+
+
+def is_websocket(request: web.BaseRequest) -> bool:
+    return request.headers.get("upgrade", "").lower() == "websocket"
+
+
+def _chunked(request: web.BaseRequest) -> bool:
+    return "transfer-encoding" in request.headers
+
+
+def _head(start: bytes, fields: Iterable[Field]) -> bytes:
+    lines = [start, *(name + b": " + value for name, value in fields)]
+    return b"\r\n".join(lines) + b"\r\n\r\n"
+
+
+async def read_some(
+    request: web.BaseRequest, silence_s: float, most_bytes: int = HIGH_BYTES
+) -> bytes:
+    """Return what came of a body, b"" at its end. Raises BadRequest for one that is broken, or
+    silent."""
+    try:
+        if data := request.content.read_nowait(most_bytes):
+            return data
+        async with asyncio.timeout(silence_s):
+            return await request.content.read(most_bytes)
+    except TimeoutError:
+        raise BadRequest(f"nothing of the body came for {silence_s:g} s") from None
+    except web.RequestPayloadError as error:
+        raise BadRequest(f"the body cannot be read: {error}") from error
 
 
 async def forward(
-    session: ClientSession,
-    request: web.BaseRequest,
-    url: str,
-    headers: CIMultiDict[str],
+    upstream: Upstream,
+    reply: Reply,
+    target: str,
+    fields: list[Field],
     begun: bytes,
-    response: web.StreamResponse | None,
-) -> web.StreamResponse:
-    """Send a request to `url` (its own target there), and its answer to the client.
+    silence_s: float,
+) -> Connection | None:
+    """Send a request to a server, and its answer to the client. Return the connection where both
+    changed to WebSocket; `tunnel` goes on with it.
 
-    `begun`: what was read of the body. `response`: one that the client gets already; its status is
-    said. Raises Unreached, or SidecarUnavailable, before anything of the answer was sent; later the
-    connection is cut.
+    `begun`: what was read of the body. `silence_s`: longest pause of the rest. Raises Unreached,
+    SidecarUnavailable; BadRequest: the body is broken or silent.
     """
-    has_body = request.body_exists or begun
-    if not has_body:
-        headers.popall("content-length", None)
     try:
-        async with session.request(
-            request.method,
-            URL(url, encoded=True),
-            headers=headers,
-            data=_body(begun, request) if has_body else None,
-            allow_redirects=False,
-        ) as answer:
-            if response is None:
-                raw = (
-                    (name.decode("latin-1"), value.decode("latin-1"))
-                    for name, value in answer.raw_headers
-                )
-                response = web.StreamResponse(
-                    status=answer.status, reason=answer.reason, headers=end_to_end(raw, frozenset())
-                )
-                await response.prepare(request)
-            try:
-                tracing.event(telemetry.EVENT_FIRST_BYTE)
-                async for data in answer.content.iter_any():
-                    await response.write(data)
-            except ClientError as error:
-                raise ConnectionAbortedError(f"the server hung up: {error}") from error
-            await response.write_eof()
-            return response
-    except ClientConnectorError as error:
+        connection = await upstream.take()
+    except OSError as error:
         raise Unreached(f"the server takes no connection: {error}", hint="see /logs") from error
-    except ClientConnectionError as error:
+    request, upload = reply.request, None
+    try:
+        host = (b"Host", upstream.host.encode())
+        start = f"{request.method} {target} HTTP/1.1".encode("utf-8", "surrogateescape")
+        begun += request.content.read_nowait()
+        connection.write(_head(start, [host, *fields]) + _framed(request, begun))
+        if not request.content.at_eof():
+            upload = asyncio.create_task(_upload(connection, request, silence_s))
+        head = await _answer(connection, reply)
+    except OSError as error:
+        connection.close()
         raise SidecarUnavailable(
             f"the server does not answer: {error}", hint="see /logs"
         ) from error
+    except BaseException:
+        connection.close()
+        raise
+    finally:
+        whole = upload is None or upload.done()
+        if upload is not None:
+            upload.cancel()
+    if head.status == SWITCHING:
+        return connection
+    if head.lasts and whole and connection.usable:
+        upstream.keep(connection)
+    else:
+        connection.close()
+    return None
 
 
-async def _body(begun: bytes, request: web.BaseRequest) -> AsyncIterator[bytes]:
-    if begun:
-        yield begun
-    async for data in request.content.iter_any():
-        yield data
+def _framed(request: web.BaseRequest, data: bytes) -> bytes:
+    """Return bytes of a body as the server gets them, with its end where all was read."""
+    if not _chunked(request):
+        return data
+    chunk = b"%x\r\n%b\r\n" % (len(data), data) if data else b""
+    return chunk + b"0\r\n\r\n" if request.content.at_eof() else chunk
+
+
+async def _upload(connection: Connection, request: web.BaseRequest, silence_s: float) -> None:
+    try:
+        while not request.content.at_eof():
+            data = await read_some(request, silence_s)
+            connection.write(_framed(request, data))
+            await connection.drain()
+    except (OSError, VramError) as error:
+        connection.fail(error)
+
+
+async def _answer(connection: Connection, reply: Reply) -> Head:
+    """Pass an answer on, and return its head. Raises SidecarUnavailable, OSError."""
+    request = reply.request
+    head = await connection.head()
+    tracing.event(telemetry.EVENT_FIRST_BYTE)
+    fields = end_to_end(head.fields, frozenset())
+    start = b"HTTP/1.1 %d%b" % (head.status, head.reason)
+    if head.status == SWITCHING:
+        if not is_websocket(request):
+            raise malformed("it changes the protocol")
+        fields += [(b"Connection", b"Upgrade"), (b"Upgrade", b"websocket")]
+        reply.transport.write(_head(start, fields))
+        reply.passes = True
+        return head
+    decoded = reply.streams or request.version < HttpVersion11
+    body = head.body(request.method, decoded=decoded)
+    if head.values(b"transfer-encoding") and not decoded:
+        fields.append((b"Transfer-Encoding", b"chunked"))
+    reply.lasts = request.keep_alive and not decoded and body.bounded
+    if not reply.lasts:
+        fields.append((b"Connection", b"close"))
+    said = b"" if reply.streams else _head(start, fields)
+    reply.passes = True
+    await connection.pass_body(said, body, reply.transport, request.writer.drain)
+    return head
 
 
 async def tunnel(
-    session: ClientSession,
-    request: web.BaseRequest,
-    target: str,
-    headers: CIMultiDict[str],
-    turn: Callable[[], AbstractAsyncContextManager[Any]],
-) -> web.StreamResponse:
-    """Pass messages of a WebSocket both ways until either end hangs up.
+    reply: Reply, server: Connection, turn: Callable[[], AbstractAsyncContextManager[Any]]
+) -> None:
+    """Pass the bytes of a WebSocket both ways until either end hangs up.
 
-    The handshake is a turn, and so is each burst of messages, until it was quiet for WS_QUIET_S: an
-    open page of ComfyUI must not keep its server on the GPU. Raises SidecarUnavailable.
+    A turn is taken for each burst of messages, until it was quiet for WS_QUIET_S: an open page of
+    ComfyUI must not keep its server on the GPU.
     """
-    names = request.headers.get("sec-websocket-protocol", "")
-    protocols = [name.strip() for name in names.split(",") if name.strip()]
-    most = WS_MESSAGE_MAX_BYTES
-    async with turn() as current:
-        try:
-            upstream = await session.ws_connect(
-                URL(current.url + target, encoded=True),
-                protocols=protocols,
-                headers=end_to_end(headers.items(), WS_OWN),
-                autoping=False,
-                max_msg_size=most,
-            )
-        except ClientError as error:
-            hint = "see /logs"
-            raise SidecarUnavailable(f"no WebSocket at {target}: {error}", hint=hint) from error
-        chosen = [upstream.protocol] if upstream.protocol else []
-        client = web.WebSocketResponse(protocols=chosen, autoping=False, max_msg_size=most)
-        await client.prepare(request)
-    bursts = _Bursts(turn)
-    there, back = _pass_on(client, upstream, bursts), _pass_on(upstream, client, bursts)
-    tasks = [asyncio.create_task(work) for work in (bursts.run(), there, back)]
+    request, client = reply.request, reply.transport
+    incoming = StreamReader(request.protocol, HIGH_BYTES, loop=asyncio.get_running_loop())
+    request.protocol.set_parser(_Incoming(incoming))  # type: ignore[arg-type]
+    bursts, back = _Bursts(turn), _Frames()
+    tasks = [
+        asyncio.create_task(bursts.run()),
+        asyncio.create_task(
+            _one_way(incoming.readany, _Frames(), bursts, server.write, server.drain)
+        ),
+        asyncio.create_task(
+            _one_way(server.read, back, bursts, client.write, request.writer.drain)
+        ),
+    ]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     finally:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        code = upstream.close_code or client.close_code
-        await upstream.close()
-        if code is None or code not in PASSED_CODES:
-            code = WSCloseCode.GOING_AWAY
-        await client.close(code=code)
-    return client
+        server.close()
+        if back.between:
+            client.write(WS_GOING_AWAY)
+
+
+async def _one_way(
+    read: Callable[[], Awaitable[bytes]],
+    frames: "_Frames",
+    bursts: "_Bursts",
+    write: Callable[[bytes], None],
+    drain: Callable[[], Awaitable[None]],
+) -> None:
+    while data := await read():
+        for at in range(0, len(data), WS_PIECE_BYTES):
+            piece = data[at : at + WS_PIECE_BYTES]
+            if frames.message_in(piece):
+                await bursts.message()
+            write(piece)
+            await drain()
+            await asyncio.sleep(0)  # others go on: thousands of frames may be in a piece
+
+
+class _Incoming:
+    """Hands a client's bytes on, as aiohttp asks a parser."""
+
+    def __init__(self, reader: StreamReader) -> None:
+        self._reader = reader
+        self.feed_eof = reader.feed_eof
+
+    def feed_data(self, data: bytes) -> tuple[bool, bytes]:
+        self._reader.feed_data(data)
+        return False, b""
+
+
+class _Frames:
+    """Tells messages from control frames in one way of a WebSocket (RFC 6455, 5.2)."""
+
+    def __init__(self) -> None:
+        self._head, self._left = b"", 0
+        self._is_message = False
+
+    @property
+    def between(self) -> bool:
+        """Whether no frame is begun."""
+        return not self._head and not self._left
+
+    def message_in(self, data: bytes) -> bool:
+        """Return whether bytes of a message are among these."""
+        at, found = 0, False
+        while at < len(data):
+            if not self._left:
+                head = self._head + data[at : at + WS_HEAD_MAX_BYTES]
+                size, self._left = _sizes(head)
+                at += min(size, len(head)) - len(self._head)
+                self._head = head if len(head) < size else b""
+                self._is_message = not head[0] & 0x08
+            found = found or self._is_message
+            passed = min(self._left, len(data) - at)
+            self._left -= passed
+            at += passed
+        return found
+
+
+def _sizes(head: bytes) -> tuple[int, int]:
+    """Return the bytes of a frame's head, and of its payload, 0 unless the head is whole."""
+    if len(head) < 2:
+        return 2, 0
+    length, masked = head[1] & 0x7F, head[1] >> 7
+    wide = {126: 2, 127: 8}.get(length, 0)
+    size = 2 + wide + 4 * masked
+    if wide:
+        length = int.from_bytes(head[2 : 2 + wide])
+    return size, length if len(head) >= size else 0
 
 
 class _Bursts:
@@ -221,22 +318,3 @@ class _Bursts:
                     left_s = self._last + WS_QUIET_S - self._now()
                 self._has.clear()
                 self._wanted.clear()
-
-
-async def _pass_on(
-    source: web.WebSocketResponse | ClientWebSocketResponse,
-    sink: web.WebSocketResponse | ClientWebSocketResponse,
-    bursts: _Bursts,
-) -> None:
-    async for message in source:
-        match message.type:
-            case WSMsgType.TEXT:
-                await bursts.message()
-                await sink.send_str(message.data)
-            case WSMsgType.BINARY:
-                await bursts.message()
-                await sink.send_bytes(message.data)
-            case WSMsgType.PING:  # says nothing of work
-                await sink.ping(message.data)
-            case WSMsgType.PONG:
-                await sink.pong(message.data)

@@ -32,6 +32,7 @@ from vram_arbiter.schemas.errors import (
 from vram_arbiter.sidecars.gateway.keys import Asker
 from vram_arbiter.sidecars.gateway.program import ASLEEP, Log, Program
 from vram_arbiter.sidecars.gateway.turns import Request, Turns
+from vram_arbiter.sidecars.gateway.upstream import Upstream
 
 log = logging.getLogger(__name__)
 
@@ -40,9 +41,9 @@ type State = Literal["away", "queued", "starting", "ready", "leaving"]
 REFUSED_S: Final = 0.25
 """After a use or a connection was refused: the program reports its revoke or its end within this
 time, or the revoke was withdrawn."""
-LINGER_S: Final = 0.05
+LINGER_S: Final = 0.5
 """A use outlives its last request for so long, unless the program is leaving: the next request is
-often there by then."""
+often there by then, and begins without a round trip to the arbiter."""
 IN_FLIGHT: Final = "requests in flight"
 """Label of the use, which a waiter reads in `why`."""
 BACKOFF_S, BACKOFF_MAX_S = 1.0, 60.0
@@ -59,10 +60,10 @@ STATES: Final[dict[str, State]] = {
 
 
 class Turn:
-    """A request's turn. `url`: where its server listens. `evicted`: it is to end now."""
+    """A request's turn, at a server's program. `end`: it is to end now."""
 
-    def __init__(self, url: str, limit: asyncio.Timeout) -> None:
-        self.url, self._limit = url, limit
+    def __init__(self, upstream: Upstream, limit: asyncio.Timeout) -> None:
+        self.upstream, self._limit = upstream, limit
         self.reason = ""
 
     def end(self, reason: str) -> None:
@@ -146,7 +147,7 @@ class Server:
         try:
             program = await self._begun(request)
             async with asyncio.timeout(None) as limit:
-                turn = Turn(program.url, limit)
+                turn = Turn(program.upstream, limit)
                 self._current.add(turn)
                 try:
                     yield turn

@@ -15,28 +15,35 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.request import urlopen
 
-import aiohttp
 import yaml
 
 from tests.bench import gpu_broker
-from tests.bench.chats import PATIENCE_S, Answer, Load, drive, timed_chat, turns
+from tests.bench.chats import Answer, Load, drive, turns
 from tests.bench.harness import SHIPPED, Suite, arbiter, p50, p99
+from tests.bench.paced import at_rate, chat, read_all, request
 from tests.support.waiting import until
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.runtime.ports import free_port
 
 PYTHON = (sys.executable, "-m")
-DOWNLOAD_BYTES = 256 << 20
-CHAT_TOKENS = 20_000
+TOKENS = 16
 ROUNDS = 3
-"""Of each figure, in turns: direct, through the gateway."""
-ROUND_S = 2.0
-PAUSES_S = {1: 0.0, 32: 0.2}
-"""By clients, the mean pause of each between requests: 32 without one measure a queue alone."""
+"""Of each figure, in turns."""
+ROUND_S = 5.0
+RATES_PER_S = {1: 20.0, 32: 160.0}
+"""Requests by clients, at random times: without a rate 32 clients measure a queue alone."""
+DOWNLOAD_BYTES = 256 << 20
+STREAMS = (
+    ("32 chats at 50 words/s", [chat(150, 0.02)] * 32, None),
+    ("chat of 20,000 words at once", [chat(20_000)], None),
+    ("download of 256 MiB", [request(f"/bytes/{DOWNLOAD_BYTES}")], DOWNLOAD_BYTES),
+)
+"""What is asked at once, and the size of its answers; None: in chunks. Only the first has a rate of
+its own, as models have; the others want all of the cores."""
 ADDED_P50_US, ADDED_P99_US, STREAMS_MIN = 1500.0, 5000.0, 0.97
 """Targets: µs added to the first byte at 32 clients, and the least ratio of rates."""
 TURNING = {"chat": "5GiB", "code": "4GiB"}
@@ -44,7 +51,6 @@ TURNING = {"chat": "5GiB", "code": "4GiB"}
 CLIENTS = 16
 """Of each of them."""
 PAUSE_S = 0.5
-TOKENS = 16
 MIN_RESIDENCY_S = 2.0
 """As shipped."""
 
@@ -69,9 +75,17 @@ def program(environ: Mapping[str, str], *words: str) -> Iterator["subprocess.Pop
         process.stdout.close()
 
 
+@dataclass(frozen=True, slots=True)
+class Running:
+    url: str
+    pid: int
+
+
 @contextmanager
-def gateway(models: Models, sizes: Mapping[str, str], environ: Mapping[str, str]) -> Iterator[str]:
-    """Run `vram-gateway serve`; yields its URL."""
+def gateway(
+    models: Models, sizes: Mapping[str, str], environ: Mapping[str, str]
+) -> Iterator[Running]:
+    """Run `vram-gateway serve`."""
     servers = {
         name: {
             "command": list(words[1:]),
@@ -89,7 +103,7 @@ def gateway(models: Models, sizes: Mapping[str, str], environ: Mapping[str, str]
             assert process.stdout is not None
             url = process.stdout.readline().strip()
             assert url, "the gateway ended"
-            yield url
+            yield Running(url, process.pid)
 
 
 @contextmanager
@@ -111,83 +125,82 @@ def _answers(url: str) -> bool:
 
 # -- one server that is awake
 def passing(suite: Suite) -> None:
-    """First bytes of 1 and 32 clients, and long streams, direct and through the gateway."""
-    port = str(free_port())
-    models = {"chat": [port, *PYTHON, "tests.bench.chat_server", port]}
-    with arbiter(SHIPPED) as daemon, gateway(models, {"chat": "1GiB"}, daemon.environ) as through:
-        direct = f"http://127.0.0.1:{port}"
-        urls = {"direct": direct, "gateway": through}
-        folders = {"direct": direct, "gateway": f"{through}/upstream/chat"}
-        asyncio.run(drive(through, ["chat"], Load(1, 0.1, 0.0, 1)))  # it starts
-        for clients, pause_s in PAUSES_S.items():
-            load = Load(clients, ROUND_S, pause_s, TOKENS)
-            first_bytes(suite, clients, _each(urls, partial(_firsts_us, load)))
-        streaming(suite, "download of 256 MiB", _each(folders, lambda url: [_download(url)]))
-        streaming(suite, f"chat of {CHAT_TOKENS} words", _each(urls, lambda url: [_chat(url)]))
+    """First bytes of 1 and 32 clients, and streams: direct, over a relay of TCP, which is what any
+    process in between costs on this machine, and through the gateway."""
+    port, between = str(free_port()), str(free_port())
+    bare = "tests.bench.chat_server"
+    models = {"chat": [port, *PYTHON, bare, port]}
+    with (
+        arbiter(SHIPPED) as daemon,
+        gateway(models, {"chat": "1GiB"}, daemon.environ) as through,
+        program(daemon.environ, bare, between, port),
+    ):
+        url = f"{through.url}/upstream/chat"
+        read_all(url, [chat(1)], None)  # it starts
+        direct, relay = (f"http://127.0.0.1:{one}" for one in (port, between))
+        until(lambda: _answers(relay))
+        urls = {"direct": direct, "relay": relay, "gateway": through.url}
+        for clients, per_s in RATES_PER_S.items():
+            first_bytes(suite, clients, per_s, urls, through.pid)
+        paths = urls | {"gateway": url}
+        for name, asked, size in STREAMS:
+            rates = _each(paths, lambda url: [read_all(url, asked, size)])  # noqa: B023
+            streaming(suite, name, rates)
 
 
-def _each(urls: Mapping[str, str], take: Callable[[str], list[float]]) -> Samples:
-    samples: dict[str, list[float]] = {name: [] for name in urls}
+def _each[T](urls: Mapping[str, str], take: Callable[[str], list[T]]) -> dict[str, list[T]]:
+    """Return what each of them gives, in turns."""
+    samples: dict[str, list[T]] = {name: [] for name in urls}
     for _ in range(ROUNDS):
         for name, url in urls.items():
             samples[name] += take(url)
     return samples
 
 
-def _firsts_us(load: Load, url: str) -> list[float]:
-    return [one.first_s * 1e6 for one in _whole(asyncio.run(drive(url, ["chat"], load)))]
-
-
-def _whole(answers: list[Answer]) -> list[Answer]:
-    """Raises AssertionError unless all came whole."""
-    assert not [one.problem for one in answers if one.problem]
-    return answers
-
-
-def _download(url: str) -> float:
-    """Return bytes per second."""
-
-    async def read() -> float:
-        timeout = aiohttp.ClientTimeout(PATIENCE_S)
-        async with aiohttp.ClientSession(timeout=timeout) as session:
-            began = time.perf_counter()
-            async with session.get(f"{url}/bytes/{DOWNLOAD_BYTES}") as reply:
-                size = 0
-                async for chunk in reply.content.iter_any():
-                    size += len(chunk)
-            assert size == DOWNLOAD_BYTES
-            return size / (time.perf_counter() - began)
-
-    return asyncio.run(read())
-
-
-def _chat(url: str) -> float:
-    """Return bytes per second, from asking to the last."""
-
-    async def read() -> Answer:
-        async with aiohttp.ClientSession(timeout=aiohttp.ClientTimeout(PATIENCE_S)) as session:
-            return await timed_chat(session, url, "chat", CHAT_TOKENS)
-
-    (one,) = _whole([asyncio.run(read())])
-    return one.size_bytes / (one.ended_at - one.asked_at)
-
-
-def first_bytes(suite: Suite, clients: int, took_us: Samples) -> None:
-    pause = f"pause {PAUSES_S[clients]:g} s"
-    for name, samples in took_us.items():
-        suite.time(f"first byte, {clients} clients, {name}", samples, pause)
+def first_bytes(
+    suite: Suite, clients: int, per_s: float, urls: Mapping[str, str], pid: int
+) -> None:
+    """`pid`: the gateway's."""
+    before, mine = cpu_s(pid), time.process_time()
+    asked = _each(urls, lambda url: at_rate(url, clients, per_s, ROUND_S, TOKENS))
+    count = sum(map(len, asked.values()))
+    through = len(asked["gateway"])
+    computed, waited = (
+        (now - then) / through * 1e3 for now, then in zip(cpu_s(pid), before, strict=True)
+    )
+    own = (time.process_time() - mine) / count * 1e3
+    costs = f"gateway {computed:.2f} ms and {waited:.2f} ms of wait for a core, client {own:.2f} ms"
+    first_us = {name: [one.first_s * 1e6 for one in found] for name, found in asked.items()}
+    for name, found in asked.items():
+        late = p99([one.late_s for one in found]) * 1e3
+        note = f"{per_s:g} requests/s, sent {late:.1f} ms late at p99"
+        note += f"; CPU of one: {costs}" if name == "gateway" else ""
+        suite.time(f"first byte, {clients} clients, {name}", first_us[name], note)
     for what, of, most in (("p50", p50, ADDED_P50_US), ("p99", p99, ADDED_P99_US)):
-        added_us = of(took_us["gateway"]) - of(took_us["direct"])
-        at_most = most if clients > 1 else None
+        floor = of(first_us["direct"])
         suite.figure(
-            f"first byte, {clients} clients: added {what}", added_us, "µs", at_most=at_most
+            f"first byte, {clients} clients: added {what}",
+            of(first_us["gateway"]) - floor,
+            "µs",
+            at_most=most if clients > 1 else None,
+            note=f"the relay adds {of(first_us['relay']) - floor:.0f} µs",
         )
 
 
+def cpu_s(pid: int) -> tuple[float, float]:
+    """Return how long a process has computed, and waited for a core."""
+    tasks = [(one / "schedstat").read_text().split() for one in Path(f"/proc/{pid}/task").iterdir()]
+    computed, waited = (sum(int(task[field]) for task in tasks) / 1e9 for field in (0, 1))
+    return computed, waited
+
+
 def streaming(suite: Suite, name: str, rates: Samples) -> None:
-    direct, through = (p50(rates[key]) for key in ("direct", "gateway"))
+    direct, relay, through = (p50(rates[key]) for key in ("direct", "relay", "gateway"))
     suite.figure(f"{name}, direct", direct / 1e6, "MB/s")
-    suite.figure(f"{name}: rate through the gateway", through / direct, "x", at_least=STREAMS_MIN)
+    note = f"over the relay {relay / direct:.2f}"
+    suite.figure(
+        f"{name}: rate through the gateway", through / direct, "x", at_least=STREAMS_MIN, note=note
+    )
 
 
 # -- two servers in room for one
@@ -206,7 +219,7 @@ def turning(suite: Suite, minutes: float, *, with_broker: bool) -> None:
             headers: Mapping[str, str] = {}
             match name:
                 case "gateway":
-                    url = stack.enter_context(gateway(models, TURNING, environ))
+                    url = stack.enter_context(gateway(models, TURNING, environ)).url
                 case "plain proxy":
                     url = stack.enter_context(plain(models, environ))
                 case _:
@@ -239,13 +252,16 @@ def took_turns(suite: Suite, name: str, answers: list[Answer]) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--minutes", type=float, default=10.0, help="of turns, on each program")
+    parser.add_argument(
+        "--minutes", type=float, default=10.0, help="of turns, on each program; 0: none"
+    )
     parser.add_argument("--gpu-broker", action="store_true", help="install it and compare")
     parser.add_argument("--out", type=Path, default=Path("out/bench/gateway.json"))
     options = parser.parse_args()
     suite = Suite()
     passing(suite)
-    turning(suite, options.minutes, with_broker=options.gpu_broker)
+    if options.minutes:
+        turning(suite, options.minutes, with_broker=options.gpu_broker)
     suite.write(options.out)
     print(f"{suite.table()}\nrows are in {options.out}")
     return 0

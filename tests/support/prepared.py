@@ -85,6 +85,14 @@ PROGRAMS: Mapping[str, Program] = {
         "vram_arbiter.clients.observer.__main__",
         ("anyio._backends._asyncio", "vram_arbiter.clients.observer.program"),
     ),
+    "vram-gateway": Program(
+        "tests.support.gateway_program",
+        (
+            "anyio._backends._asyncio",
+            "vram_arbiter.clients.client",
+            "vram_arbiter.sidecars.gateway.gateway",
+        ),
+    ),
     "echo": Program("tests.sidecars.echo_sidecar", SIDECAR, forks=True),
     "episode": Program("tests.e2e.episode_sidecar", (*SIDECAR, "numpy"), forks=True),
     "vram-sidecar": Program(

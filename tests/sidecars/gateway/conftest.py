@@ -12,6 +12,7 @@ import httpx
 import pytest
 import yaml
 
+from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
 from vram_arbiter.schemas.yamltext import TEXT_MAX_BYTES
 
@@ -26,9 +27,16 @@ def anyio_backend() -> str:
 
 
 class GatewayProcess:
-    """`vram-gateway serve`. `url`: what it printed."""
+    """`vram-gateway serve`, forked where `prepared`. `url`: what it printed."""
 
-    def __init__(self, arbiter: ArbiterProcess, config: dict[str, Any], folder: Path) -> None:
+    def __init__(
+        self,
+        arbiter: ArbiterProcess,
+        config: dict[str, Any],
+        folder: Path,
+        *,
+        prepared: bool = True,
+    ) -> None:
         self.arbiter, self.folder = arbiter, arbiter.gpu_folder
         path = folder / "gateway.yaml"
         text = yaml.safe_dump(config)
@@ -36,14 +44,19 @@ class GatewayProcess:
         path.write_text(text)
         path.chmod(0o600)
         self.errors = (folder / "gateway.log").open("wb")
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "vram_arbiter.sidecars.gateway", "serve", "--config", str(path)],
-            env={**os.environ, **arbiter.environ},
-            stdout=subprocess.PIPE,
-            stderr=self.errors,
-        )
-        assert self.process.stdout is not None
-        self.url = self.process.stdout.readline().decode().strip()
+        self.process: Forked | subprocess.Popen[bytes]
+        words, environ = ["serve", "--config", str(path)], {**os.environ, **arbiter.environ}
+        said, says = os.pipe()
+        with open(said, "rb") as output:
+            if prepared:
+                self.process = start("vram-gateway", words, environ, says, self.errors.fileno())
+            else:
+                command = [sys.executable, "-m", "vram_arbiter.sidecars.gateway", *words]
+                self.process = subprocess.Popen(
+                    command, env=environ, stdout=says, stderr=self.errors
+                )
+            os.close(says)
+            self.url = output.readline().decode().strip()
         assert self.url, (folder / "gateway.log").read_text()
         # One for all: each new one reads the certificates of the machine for 60 ms of a core.
         self.client = httpx.Client(base_url=self.url, timeout=PATIENCE_S)
@@ -69,8 +82,6 @@ class GatewayProcess:
         finally:
             self.process.kill()
             self.process.wait(PATIENCE_S)
-            assert self.process.stdout is not None
-            self.process.stdout.close()
             self.errors.close()
 
 
@@ -95,12 +106,12 @@ def gateway(
     """`gateway({"a": stand_in(…)}, keys_file=…)` starts one."""
     made: list[GatewayProcess] = []
 
-    def start(servers: dict[str, Any], **fields: Any) -> GatewayProcess:
+    def begin(servers: dict[str, Any], *, prepared: bool = True, **fields: Any) -> GatewayProcess:
         config = {"listen": "127.0.0.1:0", "servers": servers, **fields}
-        made.append(GatewayProcess(arbiter_daemon, config, tmp_path))
+        made.append(GatewayProcess(arbiter_daemon, config, tmp_path, prepared=prepared))
         return made[-1]
 
-    yield start
+    yield begin
     for one in made:
         one.close()
 

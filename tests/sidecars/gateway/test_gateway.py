@@ -142,7 +142,9 @@ async def test_a_thousand_waiting_clients_are_all_served(
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(1024, before[1]), before[1]))
     try:
-        started = gateway({name: stand_in(arbiter_daemon, 5, queue_max=500) for name in "ab"})
+        started = gateway(
+            {name: stand_in(arbiter_daemon, 5, queue_max=500) for name in "ab"}, prepared=False
+        )
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (before[1], before[1]))
 
