@@ -114,6 +114,7 @@ async def run(config: GatewayConfig, endpoint: str | None) -> None:
             ) from error
         port = listening.sockets[0].getsockname()[1]
         print(f"http://{HttpAddress(wanted.host, port)}", flush=True)
+        await asyncio.gather(*(server.adopt() for server in servers.values()))
         try:
             await stop.wait()
         finally:

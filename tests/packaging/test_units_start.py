@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 
 from tests.packaging.machine import PATIENCE_S, Machine, obstacle
+from vram_arbiter.schemas.fakegpu import FOLDER_VARIABLE
 
 OBSTACLE = obstacle()
 pytestmark = [
@@ -288,6 +289,66 @@ def test_the_unit_of_a_user_starts_in_the_manager_of_a_user(machine: Machine) ->
     assert not [path for path in left if "vram" in path]
     machine.run("systemctl", "stop", "manager.service")
     machine.run("rm", f"{SYSTEM}/manager.service")
+
+
+SERVED = "llm.service"
+ASK = r"""exec 3<>/dev/tcp/127.0.0.1/$1
+printf 'GET /upstream/llm/v1/models HTTP/1.1\r\nHost: 127.0.0.1:%s\r\nConnection: close\r\n\r\n' $1 >&3
+cat <&3"""
+
+
+def test_a_unit_under_a_lease_starts_for_a_request_and_stops_for_an_eviction(
+    machine: Machine,
+) -> None:
+    """Its processes are no descendants of the lease's holder: its cgroup is named."""
+    folder = "/run/vram-arbiter/fakegpu"
+    machine.run("chmod", "-R", "g+rwX", folder)  # a driver serves several users
+    server = "/opt/vram-arbiter/bin/python -m vram_arbiter.sidecars.gateway.stand_in llm 3GiB 8123"
+    machine.write(
+        f"{SYSTEM}/{SERVED}",
+        "[Service]\nUser=vram-robot\nGroup=vram-arbiter\nUMask=0007\n"
+        f"Environment={FOLDER_VARIABLE}={folder}\nExecStart={server}\n"
+        f"StandardError=append:/run/logs/{SERVED}.log\n",
+    )
+    machine.run("systemctl", "daemon-reload")
+    llm = {"unit": SERVED, "vram": "3GiB", "port": 8123}
+    config = {"listen": "127.0.0.1:0", "servers": {"llm": llm}}
+    machine.write("/run/gateway.yaml", json.dumps(config))
+    serve = f"vram-gateway serve --config /run/gateway.yaml --endpoint {ENDPOINT}"
+    as_process = f"echo $$ >/run/gateway.pid && exec /opt/vram-arbiter/bin/{serve}"
+    gateway = subprocess.Popen(
+        machine.inside("sh", "-c", as_process), stdout=subprocess.PIPE, text=True
+    )
+    assert gateway.stdout is not None
+    port = gateway.stdout.readline().strip().rpartition(":")[2]
+    try:
+        assert machine.show(SERVED, "ActiveState") == ["inactive"]
+        said = machine.run("bash", "-c", ASK, "bash", port)
+        assert '"id": "llm"' in said, said + machine.log(SERVED)
+        assert machine.show(SERVED, "ControlGroup") == [f"/system.slice/{SERVED}"]
+        status = machine.answer(ASKING, ENDPOINT)
+        (lease,), (gpu,) = status["leases"], status["gpus"]
+        (process,) = [one for one in gpu["processes"] if one["used_bytes"]]
+        assert (process["pid"], process["used_bytes"]) == (lease["pid"], 3 << 30)
+        assert (process["lease_ids"], gpu["stowaway_bytes"]) == ([lease["lease_id"]], 0)
+
+        machine.run("vramctl", "evict", "llm", "-r", "a test", "--endpoint", ENDPOINT)
+        answer_of(
+            lambda: True if machine.show(SERVED, "ActiveState") == ["inactive"] else None,
+            lambda: machine.log(SERVED),
+        )
+        answer_of(
+            lambda: True if not machine.answer(ASKING, ENDPOINT)["leases"] else None,
+            lambda: machine.log(ARBITER),
+        )
+        assert "HTTP/1.1 200" in machine.run("bash", "-c", ASK, "bash", port), "and starts again"
+    finally:
+        machine.run("sh", "-c", "kill $(cat /run/gateway.pid)")
+        assert gateway.wait(PATIENCE_S) == 0
+        gateway.stdout.close()
+    assert machine.show(SERVED, "ActiveState") == ["inactive"], "it ends with the gateway"
+    machine.run("rm", f"{SYSTEM}/{SERVED}")
+    machine.run("systemctl", "daemon-reload")
 
 
 LOAD = """
