@@ -71,17 +71,17 @@ class ServiceProgram:
     def send_signal(self, number: signal.Signals) -> None:
         """Pass on the first signal that asks it to end; others are its manager's matter."""
         if number in ENDING and self.running and self._asked is None:
-            self._asked = asyncio.create_task(_call(self._service.stop))
+            self._asked = asyncio.create_task(_call(self._service.stop, quiet=True))
 
     async def end(self, grace_s: float | None) -> bool:
         """Stop it, and kill it after the grace. Return whether that was needed."""
         if not self.running:
             return False
-        stopping = asyncio.create_task(_call(self._service.stop))
+        stopping = asyncio.create_task(_call(self._service.stop, quiet=True))
         await asyncio.wait({self._run}, timeout=grace_s)
         late = self.running
         if late:
-            await _call(self._service.kill)
+            await _call(self._service.kill, quiet=True)
         await self.wait()
         await stopping
         return late
@@ -112,7 +112,7 @@ class ServiceProgram:
                 place, code = await asyncio.to_thread(service.look)
                 running = bool(place)
         checking.cancel()
-        await _call(service.stop)  # a manager could start it again, without a lease
+        await _call(service.stop, quiet=True)  # a manager could start it again, without a lease
         if code and service.log:
             await _call(service.log)
         return 1 if self._misplaced else code
@@ -127,12 +127,14 @@ class ServiceProgram:
         if not f"{place}/".startswith(f"{service.cgroup}/"):
             self._misplaced = True
             say(f"{service.name} runs in the cgroup {place}, not in {service.cgroup}; ending it")
-            await _call(service.stop)
+            await _call(service.stop, quiet=True)
 
 
-async def _call(command: Sequence[str]) -> int:
+async def _call(command: Sequence[str], *, quiet: bool = False) -> int:
+    """Return the exit code of a command. `quiet`: what it prints is no word of the service."""
+    none, out = asyncio.subprocess.DEVNULL, asyncio.subprocess.DEVNULL if quiet else None
     try:
-        child = await asyncio.create_subprocess_exec(*command, stdin=asyncio.subprocess.DEVNULL)
+        child = await asyncio.create_subprocess_exec(*command, stdin=none, stdout=out)
     except OSError as error:
         say(f"{command[0]}: {error.strerror}")
         return 1
