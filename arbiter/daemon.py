@@ -49,7 +49,7 @@ from vram_arbiter.schemas.errors import AlreadyRunning, ConfigError
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.folders import LockFile
-from vram_arbiter.schemas.runtime.procfs import boot_id, start_ticks
+from vram_arbiter.schemas.runtime.procfs import boot_id, cgroup_root, start_ticks
 from vram_arbiter.schemas.runtime.router import Router
 from vram_arbiter.schemas.runtime.systemd import Notifier
 from vram_arbiter.schemas.units import format_bytes
@@ -153,6 +153,7 @@ class Daemon:
             server=self._server,
             processes_max=limits.connections_max,
             operators_gid=operators,
+            cgroup_root=cgroup_root(),
         )
         self._connect_parts(probe, sessions, undo)  # 3
         self._tell_past(places)  # 4
@@ -224,6 +225,7 @@ class Daemon:
             inbox.post,
             self._engine.owners,
             self._engine.clients,
+            self._engine.claims,
         )
         undo.callback(prober.close)
         undo.callback(inbox.close)

@@ -236,6 +236,16 @@ class Arbiter:
         """Processes with a connection, observers too. As it is at that moment."""
         return self._core.connected.keys()
 
+    def claims(self, gpu: GpuId) -> Mapping[str, tuple[ProcessKey, str]]:
+        """Process and consumer of the leases on a GPU, or away or waiting for it, by the cgroup
+        that they name. Of leases that name the same one, the oldest has it."""
+        found: dict[str, tuple[ProcessKey, str]] = {}
+        for lease in self._core.leases.values():
+            places = lease.request.gpus if lease.gpu is None else (lease.gpu,)
+            if lease.spec.cgroup is not None and gpu in places:
+                found.setdefault(lease.spec.cgroup, (lease.process, lease.spec.consumer))
+        return found
+
     def concerns(self, client: ClientId) -> bool:
         """Whether a lease, a request or a use is this client's (`sessions.concerns`)."""
         return sessions.concerns(self._core, client)

@@ -4,8 +4,9 @@ deadline.
 A reading that fails or hangs is *unknown*. A thread that hangs cannot be ended, so the GPU stays
 unknown and no further reading is started until it returns. Requests are merged, except that one
 that comes after a reading began is answered by a fresh one: a verification must never be fed with a
-reading from before its question. Bytes of children are booked on the ancestor that holds the lease
-(`tree`): ancestors are read in the thread, holders are looked up when the reading is handed on.
+reading from before its question. Bytes of children, units and containers are booked on the holder
+of their lease (`process_tree`): /proc is read in the thread, holders are looked up when the reading
+is handed on.
 """
 
 import asyncio
@@ -18,7 +19,7 @@ from typing import Literal
 
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.host.gpu.probe import GpuProbe, Reading
-from vram_arbiter.arbiter.host.process_tree import Lineage, Lineages, on_owners
+from vram_arbiter.arbiter.host.process_tree import Claims, Lineage, Lineages, on_owners
 from vram_arbiter.schemas.errors import ProbeFailed
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 
@@ -31,8 +32,8 @@ class Prober:
     """`sample(gpu)` ends by posting `MemorySampled` or `ProbeFailed`, exactly one for a request or
     for several merged ones.
 
-    `owners(gpu)` and `clients()` are processes with an account on the GPU, and with a connection.
-    They are called on the loop's thread.
+    `owners(gpu)` and `clients()` are processes with an account on the GPU, and with a connection;
+    `claims(gpu)` are the cgroups that leases name. They are called on the loop's thread.
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class Prober:
         post: Callable[[ev.Event], None],
         owners: Callable[[GpuId], Set[ProcessKey]],
         clients: Callable[[], Set[ProcessKey]],
+        claims: Callable[[GpuId], Claims],
     ) -> None:
         self.probe = probe
         self.deadline_s = deadline_s
@@ -51,6 +53,7 @@ class Prober:
         self.post = post
         self.owners = owners
         self.clients = clients
+        self.claims = claims
         self._readers = {gpu: _Reader(self, gpu) for gpu in gpus}
 
     def sample(self, gpu: GpuId) -> None:
@@ -153,10 +156,12 @@ class _Reader:
         if isinstance(outcome, Reading):
             processes = outcome.processes
             if processes:
-                owners = self._prober.owners(self._gpu)
+                prober = self._prober
+                owners = prober.owners(self._gpu)
                 named = {use.process for use in processes}
                 if named - owners or len(named) < len(processes):
-                    processes = on_owners(processes, lineages, owners, self._prober.clients())
+                    others = prober.clients(), prober.claims(self._gpu)
+                    processes = on_owners(processes, lineages, owners, *others)
             self._prober.post(
                 ev.MemorySampled(
                     self._gpu, taken_at, outcome.used_bytes, outcome.total_bytes, processes

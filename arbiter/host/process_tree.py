@@ -1,9 +1,9 @@
 """Attribution of bytes in a process *tree*: a child's bytes are charged to the ancestor that holds
-the lease.
+the lease, and those of a unit or a container to the holder of the lease that names its cgroup.
 
-In two halves: `Lineages` reads ancestors from /proc and may block (a probe's thread); `on_owners`
-attributes by the holders of that very moment (the loop's thread). Must not decide anything about
-leases: it only says which process a reading's bytes belong to.
+In two halves: `Lineages` reads ancestors and cgroups from /proc and may block (a probe's thread);
+`on_owners` attributes by the holders of that very moment (the loop's thread). Must not decide
+anything about leases: it only says which process a reading's bytes belong to.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
@@ -28,8 +28,16 @@ class Kin:
 
 
 Reader = Callable[[int], Kin | None]
-Lineage = tuple[Kin, ...]
-"""A process's ancestors, its parent first."""
+type Claims = Mapping[str, tuple[ProcessKey, str]]
+"""Holder and consumer by the cgroup that the lease names."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lineage:
+    """A process's ancestors, its parent first, and its cgroup."""
+
+    ancestors: tuple[Kin, ...]
+    cgroup: str
 
 
 def read_kin(pid: int) -> Kin | None:
@@ -41,11 +49,13 @@ def read_kin(pid: int) -> Kin | None:
 
 
 class Lineages:
-    """Ancestors of the processes of one GPU's readings. Remembers the last reading's, for a
+    """Lineages of the processes of one GPU's readings. Remembers the last reading's, for a
     process that dies before it is traced."""
 
-    def __init__(self, read: Reader = read_kin) -> None:
-        self._read = read
+    def __init__(
+        self, read: Reader = read_kin, read_cgroup: Callable[[int], str] = procfs.read_cgroup
+    ) -> None:
+        self._read, self._read_cgroup = read, read_cgroup
         self._last: dict[int, tuple[ProcessKey, Lineage]] = {}
 
     def trace(self, processes: Iterable[ProcessUse]) -> dict[ProcessKey, Lineage]:
@@ -53,7 +63,7 @@ class Lineages:
         before, self._last = self._last, {}
         found: dict[ProcessKey, Lineage] = {}
         for use in processes:
-            process, lineage = use.process, self._ancestors(use.process)
+            process, lineage = use.process, self._lineage(use.process)
             # a process that is gone is found by its pid alone
             if lineage is None and use.process.pid in before:
                 process, lineage = before[use.process.pid]
@@ -64,10 +74,11 @@ class Lineages:
                 self._last[process.pid] = (process, lineage)
         return found
 
-    def _ancestors(self, process: ProcessKey) -> Lineage | None:
+    def _lineage(self, process: ProcessKey) -> Lineage | None:
         """None if that process is gone. A parent that is younger than its child is another process
         with a reused pid: the line ends."""
-        kin = self._read(process.pid)
+        cgroup = self._read_cgroup(process.pid)
+        kin = self._read(process.pid)  # afterwards: the cgroup was that of this very process
         if kin is None or kin.process != process:
             return None
         line: list[Kin] = []
@@ -77,7 +88,7 @@ class Lineages:
                 break
             line.append(parent)
             kin = parent
-        return tuple(line)
+        return Lineage(tuple(line), cgroup)
 
 
 def on_owners(
@@ -85,12 +96,13 @@ def on_owners(
     lineages: Mapping[ProcessKey, Lineage],
     owners: Set[ProcessKey],
     clients: Set[ProcessKey],
+    claims: Claims,
 ) -> tuple[ProcessUse, ...]:
-    """The reading's processes with the bytes of children booked on their nearest ancestor that has
-    an account.
+    """The reading's processes with the bytes of children booked on their owner: the nearest
+    ancestor that has an account, else the holder of the lease that names their cgroup.
 
     A process with an account (`owners`) or a connection (`clients`) keeps its own bytes; one
-    without such an ancestor stays a stowaway. A start time of 0 matches any process with that pid.
+    without an owner stays a stowaway. A start time of 0 matches any process with that pid.
     Bytes that the driver does not say (None) make the sum unknown.
     """
     pids = {known.pid for some in (owners, clients) for known in some}
@@ -100,13 +112,13 @@ def on_owners(
         process, target = use.process, use
         has_own = process in owners or process in clients
         if not has_own and not (process.start_ticks == 0 and process.pid in pids):
-            for kin in lineages.get(process, ()):
-                if kin.process in owners:
-                    target = ProcessUse(kin.process, kin.name, use.used_bytes)
-                    names = children.setdefault(kin.process, [])
-                    if use.name and use.name not in names:  # a dying one has no name any more
-                        names.append(use.name)
-                    break
+            lineage = lineages.get(process)
+            owner = None if lineage is None else _owner(lineage, owners, claims)
+            if owner is not None:
+                target = ProcessUse(*owner, use.used_bytes)
+                names = children.setdefault(target.process, [])
+                if use.name and use.name not in names:  # a dying one has no name any more
+                    names.append(use.name)
         if (there := booked.get(target.process)) is not None:
             # what the probe calls the owner says more
             name = use.name if target is use else there.name
@@ -119,3 +131,19 @@ def on_owners(
             named = f"{booked[process].name} ({', '.join(names)})"[:NAME_MAX]
             booked[process] = replace(booked[process], name=named)
     return tuple(booked.values())
+
+
+def _owner(
+    lineage: Lineage, owners: Set[ProcessKey], claims: Claims
+) -> tuple[ProcessKey, str] | None:
+    """Return the process that a lineage's bytes are booked on, with its name; None: there is
+    none. The deepest of the cgroups that are named wins."""
+    for kin in lineage.ancestors:
+        if kin.process in owners:
+            return kin.process, kin.name
+    cgroup = lineage.cgroup
+    while cgroup:
+        if cgroup in claims:
+            return claims[cgroup]
+        cgroup = cgroup.rpartition("/")[0]
+    return None

@@ -7,6 +7,7 @@ Must not know sessions or requests.
 import grp
 import os
 import pwd
+from pathlib import Path
 
 from vram_arbiter.schemas.errors import ConfigError, NotPermitted
 from vram_arbiter.schemas.runtime.peercred import Peer
@@ -37,6 +38,38 @@ def is_operator(peer: Peer, operators_gid: int | None) -> bool:
     except KeyError:
         return False
     return operators_gid in os.getgrouplist(account.pw_name, account.pw_gid)
+
+
+def check_cgroup(peer: Peer, cgroup: str, root: Path | None, operators_gid: int | None) -> None:
+    """Raises NotPermitted for a cgroup whose bytes a lease of this peer may not have.
+
+    An operator may name any. Another user may name one whose folder, or as long as it does not
+    exist the nearest folder above it, is that user's: only that user can make it, and move
+    processes there. `root`: where the hierarchy is mounted.
+    """
+    if root is None:
+        raise NotPermitted(
+            f"the cgroup {cgroup} cannot be seen from here",
+            hint="mount the cgroup v2 hierarchy of the host (docker: --cgroupns=host)",
+        )
+    if is_operator(peer, operators_gid):
+        return
+    folder = root / cgroup[1:]
+    owner = next(uid for uid in map(_uid_of, (folder, *folder.parents)) if uid is not None)
+    if owner != peer.uid:
+        raise NotPermitted(
+            f"the cgroup {cgroup} belongs to uid {owner}, not to {peer.uid}",
+            hint="name a unit or container of your own user (systemctl --user), or ask as an "
+            "operator",
+            details={"cgroup": cgroup, "uid": owner},
+        )
+
+
+def _uid_of(folder: Path) -> int | None:
+    try:
+        return folder.stat().st_uid
+    except OSError:  # it does not exist, or its name is too long for one
+        return None
 
 
 def how_to_operate(operators_gid: int | None) -> str:

@@ -9,6 +9,7 @@ and never held anything, leaves for a new one. Must not know requests, replies o
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 from vram_arbiter.arbiter.core import events as ev
@@ -99,6 +100,8 @@ class SessionSettings:
     rate_per_process_per_s: int
     subscribers_max: int
     operators_gid: int | None
+    cgroup_root: Path | None = None
+    """Where the cgroup v2 hierarchy is mounted."""
 
 
 @dataclass(slots=True)

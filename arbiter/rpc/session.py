@@ -8,12 +8,13 @@ every limit's breach is a typed reply; no input raises.
 
 import difflib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.log import RefusalLog
 from vram_arbiter.arbiter.rpc import codec
+from vram_arbiter.arbiter.rpc.peer import check_cgroup
 from vram_arbiter.arbiter.rpc.registry import (
     Decisions,
     PeerConnection,
@@ -49,6 +50,7 @@ from vram_arbiter.schemas.wire.replies import (
     PrepareReply,
     WelcomeReply,
 )
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import DaemonView
 
 HISTORY_PAGE = 2000
@@ -147,8 +149,9 @@ class SessionTable:
         its rate.
 
         1. Charge the rate; over it: LimitExceeded, and nothing more is looked at. 2. Decode and
-        validate. 3. Without a session: hello, or UnknownSession. 4. Check the role. 5. Answer a
-        read here; everything that can change the engine becomes an event, whose effects answer.
+        validate. 3. Without a session: hello, or UnknownSession. 4. Check the role, and whose the
+        cgroup of a lease is. 5. Answer a read here; everything that can change the engine becomes
+        an event, whose effects answer.
         """
         now, request_id = self._clock(), None
         session = self._sessions.get(ClientId(f"c{connection.serial}"))
@@ -173,6 +176,10 @@ class SessionTable:
                 return True
             session.heard_at = now
             operator = _check_role(session, request)  # 4
+            for spec in _specs(request):
+                if spec.cgroup is not None:
+                    known = self._settings.cgroup_root, self._settings.operators_gid
+                    check_cgroup(session.peer, spec.cgroup, *known)
             if isinstance(request, (w.Question, w.Prepare)):  # 5
                 self._answer(session, request_id, request)
                 return True
@@ -359,6 +366,16 @@ def _check_role(session: Session, request: w.AnyRequest) -> str:
         raise NotPermitted(f"only an operator may {op}", hint="say hello as operator")
     # the peer by the kernel's word; the name is what the connection calls itself
     return f"{session.name} (uid {session.peer.uid}, pid {session.peer.process.pid})"
+
+
+def _specs(request: w.AnyRequest) -> Iterable[LeaseSpec]:
+    """Return the specs that a request brings."""
+    match request:
+        case w.Acquire(spec=spec):
+            return (spec,)
+        case w.Reattach(leases=leases):
+            return [lease.spec for lease in leases]
+    return ()
 
 
 def _check_version(hello: w.Hello) -> None:

@@ -200,6 +200,11 @@ _ERRORS: Final[Mapping[type[Refusal], _Words | Callable[[Any], _Words]]] = {
         "{no.token} is not the token of {no.lease_id}", "use the token that came with the grant"
     ),
     r.NotHolder: ("{no.lease_id} belongs to process {no.pid}", "ask as its holder"),
+    r.CgroupTaken: (
+        "the cgroup {no.cgroup} overlaps with {no.other}, whose bytes are {no.consumer}'s "
+        "({no.lease_id})",
+        "end that program first",
+    ),
     r.BadLeaseState: _bad_lease_state,
     r.BadTargetState: _bad_target_state,
     r.Ambiguous: lambda no: (

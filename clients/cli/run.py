@@ -3,7 +3,8 @@ signals on, release when it ends.
 
 The lease belongs to `vramctl`, the bytes to its child: a consumer is a process tree, and the
 arbiter charges a child's bytes to its nearest ancestor with a lease. A program that leaves the tree
-(it daemonizes) or leases for itself is not covered.
+(it daemonizes) or leases for itself is not covered. A systemd unit or a container is no child: its
+lease names its cgroup.
 
 What happens on an eviction is `clients.foreign`'s; docs/how-to/foreign-programs.md explains it.
 """
@@ -33,6 +34,7 @@ from vram_arbiter.clients.foreign.program import adopt_orphans
 from vram_arbiter.clients.foreign.run_spec import OnRevoke, RunSpec, lease_spec
 from vram_arbiter.clients.foreign.say import say
 from vram_arbiter.clients.foreign.servers import SERVERS
+from vram_arbiter.clients.foreign.service import Service, find_container, find_unit
 from vram_arbiter.clients.foreign.supervisor import Supervisor
 from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import MIN_RESIDENCY_S, NAME_MAX_CHARS
@@ -69,6 +71,15 @@ DESCRIPTIONS = {
 def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     parser.add_argument(
         "--vram", required=True, type=arguments.size, help="bytes it needs, e.g. 5GiB"
+    )
+    parser.add_argument(
+        "--unit",
+        metavar="NAME",
+        help="in place of COMMAND: a systemd service of this user, else of the machine; one that "
+        "runs is adopted, and it ends with vramctl",
+    )
+    parser.add_argument(
+        "--container", metavar="NAME", help="in place of COMMAND: a container of podman or docker"
     )
     parser.add_argument("--name", help="consumer's name (default: the program's)")
     parser.add_argument("--gpu", default="any", help="uuid, index or any (default: any)")
@@ -174,8 +185,11 @@ def _add_eviction(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     command = args.command[1:] if args.command[:1] == ["--"] else args.command
-    if not command:
-        args.parser.error("expected a program to run: vramctl run --vram 5GiB -- COMMAND")
+    if sum(map(bool, (command, args.unit, args.container))) != 1:
+        args.parser.error(
+            "expected a program to run: vramctl run --vram 5GiB -- COMMAND, or --unit NAME, or "
+            "--container NAME"
+        )
     if args.pin and args.on_revoke == "term":
         args.parser.error("--pin and --on-revoke term cannot be combined")
     if args.listen is not None:
@@ -185,8 +199,9 @@ def run(args: argparse.Namespace) -> int:
         args.parser.error(f"a pinned program is not evicted: leave out --on-evict {args.on_evict}")
     action = _action(args)
     parks = action is not None and action.parks
+    service = _service(args)
     spec = RunSpec(
-        command,
+        command if service is None else [service.name.removesuffix(".service")],
         args.name,
         args.vram,
         args.gpu,
@@ -202,6 +217,7 @@ def run(args: argparse.Namespace) -> int:
         start_s=args.start,
         min_residency_s=args.min_residency,
         control=_control(args),
+        service=service,
     )
     try:
         checked_spec(to_map(lease_spec(spec)))
@@ -224,7 +240,9 @@ def _exec_gateway(args: argparse.Namespace, command: Sequence[str]) -> NoReturn:
     }
     by_http = args.on_evict == "http"
     given = {
-        "command": command,
+        "command": command or None,
+        "unit": args.unit,
+        "container": args.container,
         "vram": args.vram,
         "on_evict": "stop" if args.on_evict == "end" else args.on_evict,
         "free_path": urls["url"].path if by_http and urls["url"] else None,
@@ -241,7 +259,7 @@ def _exec_gateway(args: argparse.Namespace, command: Sequence[str]) -> NoReturn:
         "grace_s": args.grace,
     }
     server = {key: value for key, value in given.items() if value is not None}
-    name = args.name or Path(command[0]).name
+    name = args.name or args.unit or args.container or Path(command[0]).name
     config = json.dumps({"listen": args.listen, "servers": {name: server}})
     memory = os.memfd_create("gateway")
     os.write(memory, config.encode())
@@ -274,6 +292,12 @@ def _action(args: argparse.Namespace) -> Action | None:
     return HttpAction(Request(_url(args, "url")), restoring, timeout_s)
 
 
+def _service(args: argparse.Namespace) -> Service | None:
+    if args.unit:
+        return find_unit(args.unit)
+    return find_container(args.container, args.grace) if args.container else None
+
+
 def _control(args: argparse.Namespace) -> Control | None:
     if args.control is None:
         return None
@@ -295,7 +319,7 @@ def _url(args: argparse.Namespace, option: str, default: str = "") -> str:
 async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
     """Return the program's exit code. Raises the typed error of a lease that was not granted,
     ArbiterUnreachable, CheckpointUnsupported, ConfigError; with a record also CalibrationFailed."""
-    program = shutil.which(spec.command[0])
+    program = shutil.which(spec.command[0]) if spec.service is None else ""
     if program is None:
         say(f"{spec.command[0]}: not found, or not a file that may be executed")
         return NOT_FOUND

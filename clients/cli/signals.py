@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from typing import Self
 
-from vram_arbiter.clients.foreign.program import ForeignProgram
+from vram_arbiter.clients.foreign.program import Program
 
 FORWARDED = (
     signal.SIGTERM,
@@ -34,7 +34,7 @@ class Forwarding:
 
     def __init__(self, asked_to_end: Callable[[signal.Signals], None]) -> None:
         self._asked_to_end = asked_to_end
-        self._program: ForeignProgram | None = None
+        self._program: Program | None = None
         self._early: list[signal.Signals] = []
         self._over = False
         self._loop = asyncio.get_running_loop()
@@ -47,7 +47,7 @@ class Forwarding:
             self._loop.add_signal_handler(number, self._heard, number)
         return self
 
-    def to(self, program: ForeignProgram) -> None:
+    def to(self, program: Program) -> None:
         """It has started. Signals of its terminal are blocked here from now on."""
         self._program = program
         if self._listener.ident is None:

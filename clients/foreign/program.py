@@ -11,7 +11,7 @@ import ctypes
 import os
 import signal
 from collections.abc import Mapping, Sequence
-from typing import Final, Self
+from typing import Final, Protocol, Self
 
 from vram_arbiter.schemas.runtime import procfs
 
@@ -32,8 +32,41 @@ def adopt_orphans() -> None:
         raise OSError(number, os.strerror(number))
 
 
-class ForeignProgram:
+class Program(Protocol):
     """One run of a program. `stopping`: it is ended to make room, and is to be started again."""
+
+    stopping: bool
+
+    @property
+    def running(self) -> bool: ...
+
+    async def wait(self) -> int:
+        """Return its exit code once it has ended, -n after signal n."""
+        ...
+
+    def send_signal(self, number: signal.Signals) -> None:
+        """Signal it unless it has ended."""
+        ...
+
+    async def end(self, grace_s: float | None) -> bool:
+        """End it in order, and by force after the grace. Return whether that was needed."""
+        ...
+
+    async def end_orphans(self) -> int:
+        """End its processes that outlived it. Return how many there were."""
+        ...
+
+    def tree(self) -> list[int]:
+        """Return the pids of its living processes."""
+        ...
+
+    def reap(self) -> None:
+        """Take the exit status of adopted processes that ended."""
+        ...
+
+
+class ForeignProgram:
+    """A child of this process."""
 
     def __init__(self, child: asyncio.subprocess.Process, others: frozenset[int]) -> None:
         self.pid = child.pid

@@ -7,6 +7,7 @@ from typing import Literal, Protocol
 
 from vram_arbiter.clients.foreign.actions import Action
 from vram_arbiter.clients.foreign.control import Control
+from vram_arbiter.clients.foreign.service import Service
 from vram_arbiter.schemas.defaults import MIN_RESIDENCY_S, NAME_MAX_CHARS, RESIDUE_BYTES
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
@@ -32,7 +33,8 @@ class RunSpec:
     `limit_s`: the program is ended after this time, which is no failure. `record`: the program's
     bytes are recorded, and what it prints goes to stderr. `health`: URL that answers 200 once it
     can serve, `start_s` after its start at the latest; until then it loads. `control`: another
-    program says when it is wanted: evicted, it does not return by itself.
+    program says when it is wanted: evicted, it does not return by itself. `service`: what runs in
+    place of `command`, which has its name.
     """
 
     command: list[str]
@@ -54,6 +56,7 @@ class RunSpec:
     start_s: float | None = None
     min_residency_s: float = MIN_RESIDENCY_S
     control: Control | None = None
+    service: Service | None = None
 
     @property
     def consumer(self) -> str:
@@ -67,7 +70,7 @@ class RunSpec:
     @property
     def tends_orphans(self) -> bool:
         """Whether processes that outlive the program are ended: its successor needs their room."""
-        return self.comes_back or self.control is not None
+        return self.service is None and (self.comes_back or self.control is not None)
 
 
 def lease_spec(spec: RunSpec) -> LeaseSpec:
@@ -88,4 +91,5 @@ def lease_spec(spec: RunSpec) -> LeaseSpec:
         min_residency_s=spec.min_residency_s,
         standby=spec.comes_back and spec.control is None,
         park_bytes=spec.park_bytes,
+        cgroup=None if spec.service is None else spec.service.cgroup,
     )

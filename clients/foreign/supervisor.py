@@ -26,9 +26,10 @@ from vram_arbiter.clients.foreign.actions import Action, Deadline
 from vram_arbiter.clients.foreign.control import REST, WANT, Control
 from vram_arbiter.clients.foreign.http import Request, answer
 from vram_arbiter.clients.foreign.peak import Peak
-from vram_arbiter.clients.foreign.program import STDERR, ForeignProgram
+from vram_arbiter.clients.foreign.program import STDERR, ForeignProgram, Program
 from vram_arbiter.clients.foreign.run_spec import RunSpec, lease_spec
 from vram_arbiter.clients.foreign.say import say
+from vram_arbiter.clients.foreign.service import ServiceProgram
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.errors import ActionFailed, CalibrationFailed, VramError
 from vram_arbiter.schemas.sizes import format_bytes
@@ -51,7 +52,7 @@ NO_LEASE: Final = "its lease is over"
 class Forwards(Protocol):
     """Passes signals on (`clients.cli.signals.Forwarding`)."""
 
-    def to(self, program: ForeignProgram) -> None: ...
+    def to(self, program: Program) -> None: ...
 
 
 class Supervisor:
@@ -61,7 +62,7 @@ class Supervisor:
         self._spec = spec
         self._client = client
         self._path = path
-        self._program: ForeignProgram | None = None
+        self._program: Program | None = None
         self._lease: AsyncLease | None = None
         self.peak = Peak(spec.vram_bytes)
         self._signals: Forwards | None = None
@@ -132,6 +133,8 @@ class Supervisor:
             self._finish(-number)
         elif program is not None and self._suspended:
             self._spawn(self._end_suspended(program))
+        elif program is not None and self._spec.service is not None:
+            program.send_signal(number)  # a terminal does not reach it
 
     @property
     def lease(self) -> AsyncLease:
@@ -150,14 +153,18 @@ class Supervisor:
 
     # -- the program
     async def _start(self) -> None:
-        environ = {**_environ(self.lease), **self._spec.environ}
-        out = None if self._spec.record is None else STDERR
-        self._program = await ForeignProgram.start(self._path, self._spec.command[1:], environ, out)
+        if self._spec.service is not None:
+            self._program = ServiceProgram(self._spec.service)
+        else:
+            environ = {**_environ(self.lease), **self._spec.environ}
+            out = None if self._spec.record is None else STDERR
+            arguments = self._spec.command[1:]
+            self._program = await ForeignProgram.start(self._path, arguments, environ, out)
         assert self._signals is not None
         self._signals.to(self._program)
         self._spawn(self._until_exit(self._program))
 
-    async def _until_exit(self, program: ForeignProgram) -> None:
+    async def _until_exit(self, program: Program) -> None:
         code = await program.wait()
         if not program.stopping:
             self._finish(code)
@@ -168,7 +175,7 @@ class Supervisor:
         if program is None or not program.running or program.stopping:
             return
         program.stopping = self._spec.comes_back
-        say(f"{self._reason}; sending SIGTERM")
+        say(f"{self._reason}; ending it")
         if await program.end(self._spec.grace_s):
             say(f"it did not end within {self._spec.grace_s:g} s and was killed")
         if self._spec.tends_orphans and (count := await program.end_orphans()):
@@ -183,7 +190,7 @@ class Supervisor:
         await self._program.end_orphans()
         self._finish(0)
 
-    async def _end_suspended(self, program: ForeignProgram) -> None:
+    async def _end_suspended(self, program: Program) -> None:
         grace_s = self._grace_s
         if await program.end(grace_s):
             say(f"it is suspended, did not end within {grace_s:g} s, and was killed")

@@ -33,11 +33,15 @@ class _Section(BaseModel):
 
 
 class ServerConfig(_Section):
-    """One model server: a child of the gateway, started for the first request."""
+    """One model server, started for the first request: a `command`, a `unit` or a `container`."""
 
-    command: Annotated[tuple[Argument, ...], Field(min_length=1, max_length=256)]
-    """Program and arguments, started without a shell. `{port}` stands for the port on which it
-    shall listen on 127.0.0.1."""
+    command: Annotated[tuple[Argument, ...], Field(max_length=256)] = ()
+    """Program and arguments, a child of the gateway, started without a shell. `{port}` stands for
+    the port on which it shall listen on 127.0.0.1."""
+    unit: Annotated[str, Field(max_length=255)] | None = None
+    """A service of the gateway's user's systemd, else of the machine's. It needs `port`."""
+    container: Annotated[str, Field(max_length=255)] | None = None
+    """A container of podman or docker that exists. It needs `port`."""
     vram: ByteSize
     """Bytes that it takes at its peak, as `vramctl calibrate` measures them."""
     models: Annotated[tuple[Model, ...], Field(max_length=256)] = ()
@@ -90,9 +94,13 @@ class ServerConfig(_Section):
             raise ValueError("free_path goes with on_evict: http, and on_evict: http with it")
         if self.restore_path is not None and self.on_evict != "http":
             raise ValueError("restore_path goes with on_evict: http")
+        if sum(map(bool, (self.command, self.unit, self.container))) != 1:
+            raise ValueError("expected one of `command`, `unit` and `container`")
+        if self.env and not self.command:
+            raise ValueError("env: a unit or container has an environment of its own")
         given = (*self.command[1:], *self.env.values())
         if self.port is None and not any("{port}" in one for one in given):
-            raise ValueError("expected `{port}` in the command, or `port`: where does it listen?")
+            raise ValueError("expected `port`, or `{port}` in the command: where does it listen?")
         if not self.vram:
             raise ValueError("vram: expected a size above 0, such as 6GiB")
         return self

@@ -43,6 +43,25 @@ def read_stat(pid: int, proc: Path = PROC) -> Stat | None:
         return None
 
 
+def read_cgroup(pid: int, proc: Path = PROC) -> str:
+    """Return a process's cgroup of the v2 hierarchy; "" if it has ended, or there is none."""
+    try:
+        lines = (proc / str(pid) / "cgroup").read_text(errors="replace").splitlines()
+    except OSError:
+        return ""
+    return next((line[3:] for line in lines if line.startswith("0::")), "")
+
+
+def cgroup_root(proc: Path = PROC) -> Path | None:
+    """Return where the root of the cgroup v2 hierarchy is mounted, as this process sees it."""
+    for line in (proc / "self/mountinfo").read_text().splitlines():
+        mount, _, source = line.partition(" - ")  # proc_pid_mountinfo(5)
+        root, place = mount.split()[3:5]
+        if source.startswith("cgroup2 ") and root == "/":
+            return Path(place)
+    return None
+
+
 def start_ticks(pid: int) -> int | None:
     """Return the start time of a process, a zombie too; None if there is no such process."""
     stat = read_stat(pid)

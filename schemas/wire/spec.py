@@ -7,6 +7,11 @@ from typing import Annotated, ClassVar, Literal
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.limits import STRICT, Bytes, Limits, Name, Seconds
 
+_PART = r"(\.{0,2}[^/.\x00-\x1f\x7f][^/\x00-\x1f\x7f]*|\.{3}[^/\x00-\x1f\x7f]*)"
+Cgroup = Annotated[str, Limits(max_length=1024, pattern=f"^(/{_PART})+$")]
+"""Path in the cgroup v2 hierarchy, as /proc/PID/cgroup has it after `0::`: not the root, and
+without the parts `.`, `..` and empty ones."""
+
 
 @dataclass(frozen=True, slots=True)
 class Footprint:
@@ -43,6 +48,10 @@ class LeaseSpec:
     """Evicted, it returns by itself when there is room."""
     park_bytes: Bytes = 0
     """Host RAM that keeps its weights while it is away; 0: it is not parked."""
+    cgroup: Cgroup | None = None
+    """The bytes of processes in this cgroup, and below it, are the holder's too: of a systemd unit
+    or a container, whose processes are not its descendants. It belongs to the client's user, or
+    the client may operate; no other process's lease may name one above, below or the same."""
 
     @property
     def model(self) -> str:

@@ -12,6 +12,7 @@ listens, and runs until SIGTERM. Its parts:
 - `front`: llama-swap's endpoints, limits, errors.
 - `gateway`: all of it joined; `__main__`: the command line.
 - `imports`: llama-swap's configuration → the gateway's; pure, but for its command.
+- `setup`: what runs on this machine → the gateway's configuration and unit.
 - `demo`, `stand_in`: simulated users of two stand-in servers.
 
 It must not import the daemon: a lease is `vramctl run`'s, which requests in flight use by its

@@ -16,7 +16,7 @@ from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.telemetry.commands import command
 from vram_arbiter.schemas.runtime.version import add_version
 from vram_arbiter.schemas.yamltext import read_text
-from vram_arbiter.sidecars.gateway import imports
+from vram_arbiter.sidecars.gateway import imports, setup
 
 PROGRAM: Final = "vram-gateway"
 EXIT_FAILED, EXIT_USAGE, EXIT_UNREACHABLE = 1, 2, 3
@@ -54,6 +54,12 @@ def parser() -> argparse.ArgumentParser:
     convert = commands.add_parser("import", help="convert a configuration of llama-swap")
     imports.add_arguments(convert)
     convert.set_defaults(run=imports.run)
+    begin = commands.add_parser(
+        "setup", help="find GPUs and model servers, write the configuration, start the service"
+    )
+    setup.add_arguments(begin)
+    arguments.add_endpoint(begin)
+    begin.set_defaults(run=setup.run)
     show = commands.add_parser("demo", help="two stand-in servers take turns on a simulated GPU")
     show.add_argument("--no-browser", action="store_true", help="print the page's address alone")
     show.set_defaults(run=_demo)

@@ -142,6 +142,7 @@ async def run(config: GatewayConfig, endpoint: str | None) -> None:
         port = listening.sockets[0].getsockname()[1]
         gc.freeze()  # modules stay: no collection, which delays all requests, looks at them again
         print(f"http://{HttpAddress(wanted.host, port)}", flush=True)
+        await asyncio.gather(*(server.adopt() for server in servers.values()))
         try:
             await stop.wait()
         finally:

@@ -1,7 +1,7 @@
 """One model server under one lease: a child `vramctl run --control`, its states and its log.
 
-One child for each server, because the arbiter charges bytes to processes and learns from a process
-with one lease.
+One child for each server, units and containers too, because the arbiter charges bytes to processes
+and learns from a process with one lease.
 """
 
 import asyncio
@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from typing import Final, Self
 
 from vram_arbiter.clients.foreign.control import REST, WANT
+from vram_arbiter.clients.foreign.service import find_container, find_unit
 from vram_arbiter.schemas.config.gateway import ServerConfig
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.runtime.ports import free_port
@@ -162,6 +163,13 @@ class Program:
             self._log.add(partial)
 
 
+def runs_already(config: ServerConfig) -> bool:
+    """Return whether a server is a unit or container that runs. Blocks. Raises ConfigError."""
+    if config.unit is not None:
+        return bool(find_unit(config.unit).look()[0])
+    return config.container is not None and bool(find_container(config.container, None).look()[0])
+
+
 def arguments(name: str, config: ServerConfig, port: int, endpoint: str, control: int) -> list[str]:
     """Return the arguments of `vramctl` for a server. Nothing in them is a client's."""
     url = f"http://127.0.0.1:{port}"
@@ -190,6 +198,9 @@ def arguments(name: str, config: ServerConfig, port: int, endpoint: str, control
         named["--timeout"] = f"{config.action_timeout_s}"
         if config.park is not None:
             named["--park"] = f"{config.park}B" if config.park else "0"
+    for option, service in (("--unit", config.unit), ("--container", config.container)):
+        if service is not None:
+            named[option] = service
     flags = [word for pair in named.items() for word in pair]
     return ["run", *flags, "--", *place(config.command, port)]
 

@@ -19,6 +19,7 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncForeignUse
 from vram_arbiter.schemas.config.gateway import ServerConfig
 from vram_arbiter.schemas.errors import (
+    ConfigError,
     Evicted,
     LeaseLost,
     LeaseRevoking,
@@ -30,7 +31,7 @@ from vram_arbiter.schemas.errors import (
     WaitTimeout,
 )
 from vram_arbiter.sidecars.gateway.keys import Asker
-from vram_arbiter.sidecars.gateway.program import ASLEEP, Log, Program
+from vram_arbiter.sidecars.gateway.program import ASLEEP, Log, Program, runs_already
 from vram_arbiter.sidecars.gateway.turns import Request, Turns
 from vram_arbiter.sidecars.gateway.upstream import Upstream
 
@@ -87,6 +88,7 @@ class Server:
         self._current: set[Turn] = set()
         self._program: Program | None = None
         self._starting = False
+        self._adopted = False  # it ran before the gateway: no request waits for its lease
         self._closed = False
         self._since = self._now()  # of its state
         self._refused_until = 0.0
@@ -210,6 +212,14 @@ class Server:
         if self._program is not None:
             self._program.rest()
 
+    async def adopt(self) -> None:
+        """Lease a unit or container that runs already, so that it can be evicted."""
+        try:
+            self._adopted = await asyncio.to_thread(runs_already, self.config)
+        except ConfigError as error:
+            log.warning("%s: %s", self.name, error)
+        self._advance()
+
     async def close(self) -> None:
         """End its program. Returns when it has ended."""
         self._closed = True
@@ -230,7 +240,7 @@ class Server:
             else:
                 self._after("use", LINGER_S, self._end_use)
         if program is None:
-            if self.waiting and not self._starting:
+            if (self.waiting or self._adopted) and not self._starting:
                 if now < self._not_before:
                     self._after("restart", self._not_before - now, self._advance)
                 else:
@@ -244,7 +254,7 @@ class Server:
                 self._after("idle", self.config.idle_s, self._idle)
         elif program.state in ASLEEP and self.waiting:
             program.want()
-        elif program.state == "queued" and not self.waiting and not program.granted:
+        elif program.state == "queued" and not (self.waiting or program.granted or self._adopted):
             program.end()  # give up its place: no request waits
 
     def _changed(self) -> None:
@@ -254,6 +264,7 @@ class Server:
             return
         self._since = self._now()
         self._refused_until = 0.0
+        self._adopted = self._adopted and not program.granted
         if program.state == "loading":
             self.switches += 1
         if program.leaves and self._current:
@@ -287,7 +298,7 @@ class Server:
         program = self._program
         self._advance()
         code = await program.wait()
-        self._program, self._since = None, self._now()
+        self._program, self._since, self._adopted = None, self._now(), False
         self._cancel("grace")
         if not program.leaves:
             self._failed(f"{self.name} ended with exit code {code}")

@@ -1,18 +1,21 @@
-"""A lease owns a process tree: a real daemon, the real `vramctl run`, and a child that puts its
-bytes on the simulated GPU."""
+"""A lease owns a process tree, and a cgroup: a real daemon, the real `vramctl run`, and a child
+that puts its bytes on the simulated GPU."""
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
+from vram_arbiter.schemas.runtime import procfs
 
 pytestmark = pytest.mark.e2e
 GIB = 1 << 30
@@ -147,3 +150,66 @@ def test_the_child_of_a_killed_owner_is_a_stowaway_and_contests_its_debt(
             "charged once: the debt is over, the orphan is still there"
         )
     gpu_when(watcher, lambda gpu: not gpu["stowaway_bytes"])
+
+
+HOLDER = """
+import sys
+from vram_arbiter import Client
+with Client("llm") as client, client.lease(vram="5GiB", cgroup=sys.argv[1]) as lease:
+    lease.ready()
+    print(lease.lease_id, flush=True)
+    sys.stdin.readline()
+"""
+
+
+@pytest.fixture
+def cgroup() -> Iterator[Path]:
+    """The folder of a new cgroup, below this process's own."""
+    root = procfs.cgroup_root()
+    if root is None:
+        pytest.skip("no cgroup v2 hierarchy is mounted")
+    folder = root / procfs.read_cgroup(os.getpid())[1:] / f"vram-test-{os.getpid()}"
+    try:
+        folder.mkdir()
+    except OSError as error:
+        pytest.skip(f"no cgroup can be made: {error}")
+    yield folder
+    folder.rmdir()
+
+
+def test_the_bytes_of_a_cgroup_are_those_of_the_lease_that_names_it(
+    quick_reader: ArbiterProcess, watcher: WireClient, cgroup: Path
+) -> None:
+    """The job is no descendant of the holder. Its bytes, there before the lease, are not counted
+    twice; a sibling's stay a stowaway's."""
+    root = procfs.cgroup_root()
+    assert root is not None
+    python = [sys.executable, "-c"]
+    into = ["sh", "-c", f'echo $$ >{cgroup}/cgroup.procs && exec "$@"', "sh"]
+    job = [*python, CHILD, str(quick_reader.gpu_folder), str(4 * GIB)]
+    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with contextlib.ExitStack() as ending:
+        inside = ending.enter_context(subprocess.Popen([*into, *job], **pipes))
+        gpu_when(watcher, lambda gpu: gpu["stowaway_bytes"] == 4 * GIB)
+        holder = ending.enter_context(
+            subprocess.Popen(
+                [*python, HOLDER, f"/{cgroup.relative_to(root)}"],
+                env=quick_reader.environ,
+                **pipes,
+            )
+        )
+        assert holder.stdout is not None
+        lease_id = holder.stdout.readline().strip()
+        gpu = gpu_when(watcher, lambda gpu: not gpu["stowaway_bytes"])
+        (process,) = gpu["processes"]
+        assert (process["pid"], process["used_bytes"], process["lease_ids"]) == (
+            holder.pid,
+            4 * GIB,
+            [lease_id],
+        )
+        assert process["name"] == "llm (job)"
+        assert (gpu["charged_bytes"], gpu["pressure_bytes"]) == (5 * GIB, 0)
+        for ended in (inside, holder):  # the job's bytes go, then its lease
+            ended.communicate("\n", PATIENCE_S)
+    gpu_when(watcher, lambda gpu: not gpu["charged_bytes"])
+    assert told(watcher, "pressure", "lost") == []

@@ -37,9 +37,11 @@ EXPOSURES_MAX = {
     "system/vram-runner@.service": 2.3,  # and cameras, motor buses and realtime scheduling
     "system/vram-reasoner@.service": 1.6,  # the network of a language model
     "system/vram-reasoner.service": 1.6,
+    "system/vram-gateway.service": 2.4,  # root's uid, for units and containers of the machine
     # The tool counts what only a privileged manager can restrict, as if a user's manager could.
     "user/vram-arbiter.service": 6.2,
     "user/vram-reasoner.service": 6.5,
+    "user/vram-gateway.service": 9.6,  # it starts containers of the user, without limits
 }
 """Figures of systemd 252. Each unit is at most 0.1 below its limit, so that a setting that goes
 missing shows."""
@@ -83,14 +85,16 @@ def installed(tmp_path: Path) -> Path:
 
 # -- what systemd says
 @needs_analyze
-@pytest.mark.parametrize("name", [*UNITS, "vram-observer.service"])
+@pytest.mark.parametrize("name", [*UNITS, "vram-observer.service", "vram-gateway.service"])
 def test_verify_is_silent(installed: Path, name: str) -> None:
     done = analyze("verify", "--man=no", str(installed / "etc/systemd/system" / name))
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 @needs_analyze
-@pytest.mark.parametrize("name", ["vram-arbiter.service", "vram-reasoner.service"])
+@pytest.mark.parametrize(
+    "name", ["vram-arbiter.service", "vram-reasoner.service", "vram-gateway.service"]
+)
 def test_verify_is_silent_about_the_user_instance(
     installed: Path, tmp_path: Path, name: str
 ) -> None:
@@ -166,7 +170,7 @@ STOPPING_TIES = ("Requires", "Requisite", "BindsTo", "PartOf", "PropagatesStopTo
                  "OnFailure")  # fmt: skip
 
 
-@pytest.mark.parametrize("name", HOLDERS)
+@pytest.mark.parametrize("name", [*HOLDERS, "vram-gateway.service"])
 def test_holders_want_the_arbiter_and_nothing_more(name: str) -> None:
     found = unit(name)
     assert found["Unit", "Wants"] == ["vram-arbiter.service"]
@@ -257,7 +261,7 @@ def test_a_purge_knows_every_folder_of_the_units() -> None:
 
 def test_the_flags_of_the_units_are_understood() -> None:
     """`ExecStart=` is a command line of ours: its options are those of the programs."""
-    for name in UNITS:
+    for name in (*UNITS, "vram-gateway.service"):
         (line,) = unit(name)["Service", "ExecStart"]
         path, *arguments = line.replace("%i", "sim").split()
         assert unknown_flags(Path(path).name, arguments) == [], name

@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 
 from tests.packaging.machine import PATIENCE_S, Machine, obstacle
+from vram_arbiter.schemas.fakegpu import FOLDER_VARIABLE
 
 OBSTACLE = obstacle()
 pytestmark = [
@@ -288,6 +289,69 @@ def test_the_unit_of_a_user_starts_in_the_manager_of_a_user(machine: Machine) ->
     assert not [path for path in left if "vram" in path]
     machine.run("systemctl", "stop", "manager.service")
     machine.run("rm", f"{SYSTEM}/manager.service")
+
+
+SERVED, GATEWAY = "llm.service", "vram-gateway.service"
+ASK = r"""exec 3<>/dev/tcp/127.0.0.1/$1
+printf 'GET /upstream/llm/v1/models HTTP/1.1\r\nx-api-key: %s\r\n' $2 >&3
+printf 'Host: 127.0.0.1:%s\r\nConnection: close\r\n\r\n' $1 >&3
+cat <&3"""
+
+
+def test_setup_puts_a_unit_under_a_lease_which_stops_and_starts_it(machine: Machine) -> None:
+    """A model server that runs is found, adopted with its bytes, stopped by an eviction, and
+    started by a request. Its processes are no descendants of the lease's holder."""
+    folder = "/run/vram-arbiter/fakegpu"
+    machine.run("chmod", "-R", "g+rwX", folder)  # a driver serves several users
+    stand_in = "/opt/vram-arbiter/bin/python -m vram_arbiter.sidecars.gateway.stand_in llm 3GiB"
+    machine.write("/usr/local/bin/llama-server", f"#!/bin/sh\nexec {stand_in} $2\n")
+    machine.run("chmod", "755", "/usr/local/bin/llama-server")
+    machine.write(
+        f"{SYSTEM}/{SERVED}",
+        "[Service]\nUser=vram-robot\nGroup=vram-arbiter\nUMask=0007\n"
+        f"Environment={FOLDER_VARIABLE}={folder}\n"
+        "ExecStart=/usr/local/bin/llama-server --port 8123\n"
+        f"StandardError=append:/run/logs/{SERVED}.log\n",
+    )
+    machine.run("systemctl", "daemon-reload")
+    machine.start(SERVED)
+
+    def read() -> tuple[list[Any], dict[str, Any]]:
+        """All leases, and the process that holds bytes."""
+        status = machine.answer(ASKING, ENDPOINT)
+        used = [one for one in status["gpus"][0]["processes"] if one["used_bytes"]]
+        return status["leases"], used[0] if used else {}
+
+    def log() -> str:
+        return machine.log(SERVED) + machine.log(GATEWAY)
+
+    answer_of(lambda: read()[1] or None, log)
+    setup = ("/opt/vram-arbiter/bin/vram-gateway", "setup", "--endpoint", ENDPOINT)
+    text = machine.run(*setup, "--dry-run")
+    assert "unit: llm.service" in text
+    said = machine.run(*setup).splitlines()
+    assert machine.read("/etc/vram-arbiter/gateway.yaml") == text
+    port, key = said[1].rpartition(":")[2], said[3].partition("=")[2]
+
+    leases, process = answer_of(
+        lambda: found if (found := read())[1].get("lease_ids") else None, log
+    )
+    assert leases[0]["consumer"] == "llm"
+    assert (process["used_bytes"], process["stowaway"]) == (3 << 30, False)
+    assert process["lease_ids"] == [leases[0]["lease_id"]]
+    machine.run("vramctl", "evict", "llm", "-r", "a test", "--endpoint", ENDPOINT)
+    answer_of(lambda: True if read() == ([], {}) else None, log)
+    assert machine.show(SERVED, "ActiveState") == ["inactive"]
+    assert '"id": "llm"' in machine.run("bash", "-c", ASK, "bash", port, key), log()
+    assert [one["consumer"] for one in read()[0]] == ["llm"]
+
+    machine.run("systemctl", "disable", "--now", GATEWAY)
+    assert machine.show(SERVED, "ActiveState") == ["inactive"], "it ends with the gateway"
+    settings = "/etc/vram-arbiter"
+    for path in (f"{SYSTEM}/{SERVED}", "/usr/local/bin/llama-server"):
+        machine.run("rm", path)
+    machine.run("rm", f"{settings}/gateway.yaml", f"{settings}/gateway-keys.yaml")
+    machine.run("systemctl", "daemon-reload")
 
 
 LOAD = """

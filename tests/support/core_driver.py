@@ -389,6 +389,7 @@ class Consumer:
         standby: bool = False,
         park_bytes: int = 0,
         key: str | None = None,
+        cgroup: str | None = None,
     ) -> LeaseSpec:
         """A spec with the bytes that matter; no residue, no residency and a long ttl unless asked
         for.
@@ -406,6 +407,7 @@ class Consumer:
             min_residency_s=min_residency_s,
             standby=standby,
             park_bytes=park_bytes,
+            cgroup=cgroup,
         )
 
     def acquire(

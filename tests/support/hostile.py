@@ -134,6 +134,8 @@ class Forger:
     def _text(self, schema: Mapping[str, Any], name: str) -> str:
         if name in ("lease_id", "target"):
             return self._draw.choice(self.lease_ids)
+        if name == "cgroup":
+            return self._draw.choice(["/a", "/a/b.service", "/" + "x" * 1023])
         text: str = self._draw.choice(
             ["a", "u1", "any", "0", "L1-1", "π", "x" * schema.get("maxLength", 20)]
         )

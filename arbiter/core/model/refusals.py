@@ -45,6 +45,15 @@ class NotHolder(Refusal, code="not_permitted"):
     pid: int
 
 
+class CgroupTaken(Refusal, code="not_permitted"):
+    """The cgroup overlaps with that of another process's lease."""
+
+    cgroup: str
+    lease_id: str
+    consumer: str
+    other: str
+
+
 # -- states
 class Misfit(StrEnum):
     """Why a request does not fit the state of its lease."""

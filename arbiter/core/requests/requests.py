@@ -97,6 +97,7 @@ def acquire(core: Core, asked: ev.Asked, request: w.Acquire) -> None:
     """Queue a lease. The scheduling after this event may grant it at once, and answers either way.
 
     Raises Refused.
+      0. Its cgroup is charged to no other process.
       1. A lease of this process for the model that is away comes back for it.
       2. A repeat, known by its nonce, is answered as its lease is.
       3. The request fits on some GPU, as far as its model is known.
@@ -105,6 +106,8 @@ def acquire(core: Core, asked: ev.Asked, request: w.Acquire) -> None:
       6. The lease is new, and waits in the queues.
     """
     client, spec = core.clients[asked.client], request.spec
+    if spec.cgroup is not None:  # 0
+        _check_cgroup(core, client, spec.cgroup)
     known = _known_by(core, client, request.nonce)
     mine = core.leases_of(client.process) if core.away else []
     away = standby.wanted(mine, request, known) if mine else None
@@ -123,6 +126,17 @@ def acquire(core: Core, asked: ev.Asked, request: w.Acquire) -> None:
     if core.costs.failures:  # 5
         check_load(core.costs, [core.gpus[gpu] for gpu in gpus], spec, load_peak, core.now)
     core.enqueue(_new_lease(core, asked, request, load_peak, steady, gpus))  # 6
+
+
+def _check_cgroup(core: Core, client: Client, cgroup: str) -> None:
+    """Raises Refused where another process's lease names an overlapping cgroup: bytes would have
+    two holders."""
+    for lease in core.leases.values():
+        other = lease.spec.cgroup
+        if other is not None and lease.process != client.process:
+            shorter, longer = sorted((f"{other}/", f"{cgroup}/"), key=len)
+            if longer.startswith(shorter):
+                raise Refused(no.CgroupTaken(cgroup, lease.id, lease.spec.consumer, other))
 
 
 def _known_by(core: Core, client: Client, nonce: str) -> Lease | None:

@@ -13,6 +13,7 @@ from vram_arbiter.schemas.errors import ConfigError
 ARBITER = "vram-arbiter.service"
 PROGRAMS = (
     "vram-arbiter", "vramctl", "vram-observer", "vram-sidecar", "vram-runner", "vram-reasoner",
+    "vram-gateway",
 )  # fmt: skip
 LINK = "-> "
 """Begins the text of a link; its target follows."""

@@ -65,6 +65,7 @@ def probing(
             posted.put_nowait,
             owners,
             frozenset,
+            lambda _: {},
         )
         async with asyncio.timeout(PATIENCE_S):
             await test(prober, probe, posted)

@@ -3,6 +3,7 @@ list."""
 
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -557,6 +558,56 @@ def test_an_unreachable_peer_is_no_error(session_bench: Bench) -> None:
     assert session_bench.ask("ping") == {}
     connection.reachable = True
     assert session_bench.ask("ping")["ok"]
+
+
+def ask_with_cgroup(bench: Bench, via: bytes, cgroup: str) -> Mapping[str, Any]:
+    spec = {"consumer": "c", "model_id": "m", "footprint": FOOTPRINT, "cgroup": cgroup}
+    return bench.ask("acquire", via, nonce="n", spec=spec)
+
+
+def test_a_cgroup_is_its_owners_and_the_operators(tmp_path: Path) -> None:
+    """As long as it does not exist it is of the nearest folder above it, whose user can make it."""
+    session_bench = make_bench(cgroup_root=tmp_path)
+    (tmp_path / "user.slice/user-54321").mkdir(parents=True)
+    os.chown(tmp_path / "user.slice/user-54321", STRANGER.uid, STRANGER.gid)
+    session_bench.hello()
+    session_bench.hello(via=b"x", peer=STRANGER)
+    session_bench.events.clear()
+    long = "/user.slice/user-54321/" + "n" * 900  # longer than a name may be: it has no folder
+    for mine in ("/user.slice/user-54321", "/user.slice/user-54321/new.slice/a.service", long):
+        assert ask_with_cgroup(session_bench, b"x", mine) == {}
+    for theirs in ("/user.slice", "/user.slice/user-1", "/system.slice/a.service"):
+        refused = ask_with_cgroup(session_bench, b"x", theirs)
+        assert code(refused) == "not_permitted"
+        assert f"belongs to uid {os.getuid()}, not to 54321" in refused["error"]["message"]
+        lease = {"lease_id": "L3-1", "token": [3, 1], "state": "held"}
+        spec = {"consumer": "c", "model_id": "m", "footprint": FOOTPRINT, "cgroup": theirs}
+        again = session_bench.ask("reattach", b"x", leases=[{**lease, "spec": spec}])
+        assert code(again) == "not_permitted"
+        assert ask_with_cgroup(session_bench, b"a", theirs) == {}, "its user is the daemon's own"
+    assert len(session_bench.events) == 6
+
+
+def test_paths_that_are_not_a_cgroups_and_machines_without_any_are_refused() -> None:
+    session_bench = make_bench()
+    session_bench.hello()
+    for wrong in (
+        "",
+        "/",
+        "a",
+        "/a/",
+        "//a",
+        "/.",
+        "/..",
+        "/a/../b",
+        "/a/./b",
+        "/a\n",
+        "/" + "a/" * 600,
+    ):
+        assert code(ask_with_cgroup(session_bench, b"a", wrong)) == "bad_request", wrong
+    refused = ask_with_cgroup(session_bench, b"a", "/.hidden/..b/...")
+    assert code(refused) == "not_permitted"
+    assert "cgroupns=host" in refused["error"]["hint"]
 
 
 def test_bad_frames_change_nothing(session_bench: Bench) -> None:

@@ -20,7 +20,7 @@ from tests.support.leases import view_of
 from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients import cuda
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.clients.foreign.program import ForeignProgram
+from vram_arbiter.clients.foreign.program import Program
 from vram_arbiter.clients.foreign.run_spec import RunSpec
 from vram_arbiter.clients.foreign.supervisor import Supervisor
 from vram_arbiter.clients.sync import Client
@@ -265,7 +265,7 @@ def test_a_higher_priority_behind_an_equal_one_ends_the_program(
         assert "next waits" in error_line(process)
         lease = client.acquire(spec("b", 5), PATIENCE_S)
         assert process.wait(PATIENCE_S) == 5
-        assert "b needs the room; sending SIGTERM" in error_line(process)
+        assert "b needs the room; ending it" in error_line(process)
     lease.release()
     assert equal.wait(PATIENCE_S) == 0
 
@@ -280,7 +280,7 @@ def test_an_operator_ends_the_program_although_it_keeps_another_waiting(
         assert "next waits" in error_line(process)
         assert vramctl("evict", "job", "--reason", "lunch", environ=environ).returncode == 0
         assert process.wait(PATIENCE_S) == 5
-        assert "lunch; sending SIGTERM" in error_line(process)
+        assert "lunch; ending it" in error_line(process)
     assert equal.wait(PATIENCE_S) == 0
 
 
@@ -325,7 +325,7 @@ async def test_the_peak_is_what_the_arbiter_measured_of_the_program(
     spec = RunSpec(command, "job", 1 << 30, "any", 40, None, False, "priority", None)
 
     class Signals:
-        def to(self, program: ForeignProgram) -> None:
+        def to(self, program: Program) -> None:
             self.program = program
 
     async with (

@@ -118,7 +118,7 @@ def test_a_stopped_program_is_started_again(
     with running(arbiter_daemon, "--on-evict", "stop", "--", *program) as run:
         first, orphan = map(int, run.line().split())
         lease = client.acquire(spec("b", 5), PATIENCE_S)
-        run.said("sending SIGTERM")
+        run.said("ending it")
         run.said("ended 1 of its processes")
         assert not alive(first)
         assert not alive(orphan)
@@ -187,7 +187,7 @@ def test_without_host_ram_a_server_that_needs_it_is_stopped(
         server(arbiter, "vllm", "--url", "URL") as (run, pid),
     ):
         lease = client.acquire(spec("b", 5), PATIENCE_S)
-        run.said("no 5 GiB of host RAM for its weights; sending SIGTERM")
+        run.said("no 5 GiB of host RAM for its weights; ending it")
         assert not alive(pid)
         lease.release()
         assert int(run.line()) != pid

@@ -10,7 +10,7 @@ import pytest
 from tests.support.grants_at_once import GrantsAtOnce
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.clients.foreign.program import ForeignProgram
+from vram_arbiter.clients.foreign.program import Program
 from vram_arbiter.clients.foreign.run_spec import OnRevoke, RunSpec
 from vram_arbiter.clients.foreign.supervisor import Supervisor
 from vram_arbiter.schemas.wire.spec import LeaseSpec
@@ -49,9 +49,9 @@ class Notes:
 class Signals:
     """Signals that nobody sends."""
 
-    program: ForeignProgram
+    program: Program
 
-    def to(self, program: ForeignProgram) -> None:
+    def to(self, program: Program) -> None:
         self.program = program
 
 

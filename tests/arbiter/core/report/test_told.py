@@ -195,6 +195,7 @@ def test_a_record_holds_all_that_was_asked_for() -> None:
         "standby": True,
         "park_bytes": GIB,
         "key": "grasp",
+        "cgroup": "/system.slice/det.service",
     }
     spec = det.spec(3 * GIB, 2 * GIB, **wishes)
     same = sum(
