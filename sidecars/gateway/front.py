@@ -8,7 +8,7 @@ import asyncio
 import json
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import asynccontextmanager
 from typing import Final
 from urllib.parse import unquote
@@ -36,6 +36,7 @@ from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.urls import HttpAddress
 from vram_arbiter.sidecars.gateway import proxy
 from vram_arbiter.sidecars.gateway.keys import Asker, Keys
+from vram_arbiter.sidecars.gateway.logs import following
 from vram_arbiter.sidecars.gateway.routing import finder_of, no_model
 from vram_arbiter.sidecars.gateway.server import Server, Turn
 
@@ -43,6 +44,9 @@ log = logging.getLogger(__name__)
 
 OWNER: Final = "vram-gateway"
 UPSTREAM: Final = "/upstream/"
+LOGS_STREAM: Final = "/logs/stream"
+SLOW_S: Final = 10.0
+TOO_SLOW: Final = b"vram-gateway: lines were lost: they came faster than they were read\n"
 RETRY_AFTER_S: Final = 5
 CONNECT_TRIES: Final = 10
 STATUS: Final[Mapping[type[VramError], int]] = {
@@ -102,6 +106,8 @@ class Front:
             asker = self._asker(request)
             if (own := self._own.get(request.path)) is not None:
                 return own(request, asker)
+            if f"{request.path}/".startswith(f"{LOGS_STREAM}/"):
+                return await self._follow_logs(request, asker)
             return await self._serve(request, asker)
         except VramError as error:
             return failure(error)
@@ -308,12 +314,21 @@ class Front:
         return web.Response(text="OK")
 
     def _logs(self, request: web.BaseRequest, asker: Asker) -> web.Response:
-        lines = [
-            f"{server.name}: {line}\n"
-            for server in self._chosen(request, asker)
-            for line in server.log.lines
-        ]
-        return web.Response(text="".join(lines))
+        return web.Response(text=_history(self._chosen(request, asker)))
+
+    async def _follow_logs(self, request: web.BaseRequest, asker: Asker) -> web.StreamResponse:
+        """Send what servers printed, and print until the client leaves or falls behind."""
+        model = request.path.removeprefix(LOGS_STREAM).removeprefix("/")
+        servers = [self._server_of(model, asker)] if model else self._visible(asker)
+        response = web.StreamResponse(headers={"Content-Type": "text/plain; charset=utf-8"})
+        await response.prepare(request)
+        with following(server.log for server in servers) as reader:
+            text = b"" if "no-history" in request.query else _history(servers).encode()
+            while not reader.late:
+                await _write(response, text)
+                text = await reader.take()
+            await _write(response, text + TOO_SLOW)
+        return response
 
     def _chosen(self, request: web.BaseRequest, asker: Asker) -> list[Server]:
         """Return the servers that `?model=` names, or all. Raises UnknownModel."""
@@ -388,6 +403,19 @@ def _body(error: VramError) -> dict[str, object]:
         **error.details,
     }
     return {"type": "error", "error": said}
+
+
+async def _write(response: web.StreamResponse, data: bytes) -> None:
+    """Send a part of an answer. Raises ConnectionAbortedError where it is not read for SLOW_S."""
+    try:
+        async with asyncio.timeout(SLOW_S):
+            await response.write(data)
+    except TimeoutError as error:
+        raise ConnectionAbortedError(f"nothing was read for {SLOW_S:g} s") from error
+
+
+def _history(servers: Iterable[Server]) -> str:
+    return "".join(server.log.text() for server in servers)
 
 
 async def _continue(request: web.BaseRequest) -> None:

@@ -30,7 +30,8 @@ from vram_arbiter.schemas.errors import (
     WaitTimeout,
 )
 from vram_arbiter.sidecars.gateway.keys import Asker
-from vram_arbiter.sidecars.gateway.program import ASLEEP, Log, Program
+from vram_arbiter.sidecars.gateway.logs import Log
+from vram_arbiter.sidecars.gateway.program import ASLEEP, Program
 from vram_arbiter.sidecars.gateway.turns import Request, Turns
 
 log = logging.getLogger(__name__)
@@ -76,7 +77,7 @@ class Server:
     def __init__(
         self, name: str, config: ServerConfig, client: AsyncClient, reserved: Mapping[str, int]
     ) -> None:
-        self.name, self.config, self.log = name, config, Log()
+        self.name, self.config, self.log = name, config, Log(name)
         self.switches = 0
         """How often its program was started or woken."""
         self._client = client

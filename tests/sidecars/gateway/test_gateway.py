@@ -213,10 +213,13 @@ async def test_a_server_that_dies_says_why_and_is_started_again(
         assert "exit code 5" in str(raised.value)
         assert "no such model" in str(raised.value)
         pid = await asyncio.to_thread(pid_of, started, "a")
-        with pytest.raises(openai.InternalServerError, match="about to die"):
-            await client.chat.completions.create(
-                model="a", messages=[{"role": "user", "content": "die"}]
-            )
+        with started.client.stream("GET", "/logs/stream/a?no-history") as followed:
+            with pytest.raises(openai.InternalServerError, match="about to die"):
+                await client.chat.completions.create(
+                    model="a", messages=[{"role": "user", "content": "die"}]
+                )
+            lines = followed.iter_lines()
+            assert await asyncio.to_thread(next, lines) == "a: about to die"
         await eventually(lambda: "a" not in started.running())
         assert await asyncio.to_thread(pid_of, started, "a") != pid
 
