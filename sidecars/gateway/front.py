@@ -271,16 +271,26 @@ class Front:
     async def _turn(
         self, request: web.BaseRequest, server: Server, asker: Asker
     ) -> AsyncIterator[Turn]:
-        """Record a turn of the request: span, wait, duration."""
+        """Record a turn of the request: span, wait, duration, and that it waits or is in flight."""
         now = asyncio.get_running_loop().time
         labels = {telemetry.ATTR_CONSUMER: server.name}
         came, traceparent = now(), request.headers.get("traceparent")
         with tracing.span(telemetry.SPAN_GATEWAY_REQUEST, traceparent, labels):
-            async with server.turn(asker) as turn:
-                tracing.event(telemetry.EVENT_GRANTED)
-                granted = now()
-                meters.measure(telemetry.METRIC_GATEWAY_WAIT, granted - came, labels)
-                yield turn
+            awake, phase = server.state == "ready", telemetry.METRIC_GATEWAY_WAITING
+            meters.shift(phase, 1, labels)
+            try:
+                async with server.turn(asker) as turn:
+                    meters.shift(phase, -1, labels)
+                    phase = telemetry.METRIC_GATEWAY_IN_FLIGHT
+                    meters.shift(phase, 1, labels)
+                    if not awake:
+                        tracing.event(telemetry.EVENT_WOKEN)
+                    tracing.event(telemetry.EVENT_GRANTED)
+                    granted = now()
+                    meters.measure(telemetry.METRIC_GATEWAY_WAIT, granted - came, labels)
+                    yield turn
+            finally:
+                meters.shift(phase, -1, labels)
             meters.measure(telemetry.METRIC_GATEWAY_REQUEST, now() - granted, labels)
 
     # -- the gateway's own answers

@@ -19,6 +19,7 @@ pytest.importorskip("aiohttp", reason="the extra `gateway`")
 import aiohttp
 
 from tests.sidecars.gateway.conftest import KEY, PATIENCE_S, GatewayProcess, stand_in
+from tests.support.collector import Collector
 from tests.support.leases import view_of
 from tests.support.process import ArbiterProcess
 from tests.support.waiting import until
@@ -26,6 +27,15 @@ from vram_arbiter.clients.sync import Client
 from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.llm.http import JsonHttp
 from vram_arbiter.schemas.runtime import procfs
+from vram_arbiter.schemas.runtime.telemetry.names import (
+    ATTR_CONSUMER,
+    EVENT_FIRST_BYTE,
+    EVENT_GRANTED,
+    EVENT_WOKEN,
+    METRIC_GATEWAY_IN_FLIGHT,
+    METRIC_GATEWAY_WAITING,
+    SPAN_GATEWAY_REQUEST,
+)
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 Start = Callable[..., GatewayProcess]
@@ -60,24 +70,37 @@ async def eventually(condition: Callable[[], object]) -> None:
 
 # -- a stock client
 async def test_the_first_request_starts_its_server_and_an_idle_one_leaves(
-    gateway: Start, arbiter_daemon: ArbiterProcess
+    gateway: Start, arbiter_daemon: ArbiterProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started = gateway(
-        {
-            "a": stand_in(arbiter_daemon, 3, models=["gpt-4o-mini"], idle_s=0.2),
-            "b": stand_in(arbiter_daemon, 3),
-        }
-    )
-    async with openai_client(started) as client:
-        models = [model.id async for model in client.models.list()]
-        assert models == ["a", "gpt-4o-mini", "b"]
-        assert not started.running()
-        assert await ask(client, "gpt-4o-mini") == ANSWER
-        assert await ask(client, "b") == ANSWER
-    await eventually(lambda: set(started.running()) == {"b"})  # both fit; `a` was idle
-    with Client("t", endpoint=arbiter_daemon.endpoint) as arbiter:
-        assert [lease.consumer for lease in arbiter.status().leases] == ["b"]
-    assert "a: serves on" in started.logs()
+    with Collector() as collector:
+        for name, value in collector.environ().items():
+            monkeypatch.setenv(name, value)
+        started = gateway(
+            {
+                "a": stand_in(arbiter_daemon, 3, models=["gpt-4o-mini"], idle_s=0.2),
+                "b": stand_in(arbiter_daemon, 3),
+            }
+        )
+        async with openai_client(started) as client:
+            models = [model.id async for model in client.models.list()]
+            assert models == ["a", "gpt-4o-mini", "b"]
+            assert not started.running()
+            assert await ask(client, "gpt-4o-mini") == ANSWER
+            assert await ask(client, "b") == ANSWER
+            assert await ask(client, "b") == ANSWER
+        await eventually(lambda: set(started.running()) == {"b"})  # both fit; `a` was idle
+        with Client("t", endpoint=arbiter_daemon.endpoint) as arbiter:
+            assert [lease.consumer for lease in arbiter.status().leases] == ["b"]
+        assert "a: serves on" in started.logs()
+        started.close()
+        asked = [
+            [event.name for event in span.events] for span in collector.spans(SPAN_GATEWAY_REQUEST)
+        ]
+        passed = [EVENT_GRANTED, EVENT_FIRST_BYTE]
+        assert asked == [[EVENT_WOKEN, *passed], [EVENT_WOKEN, *passed], passed]
+        for metric in (METRIC_GATEWAY_WAITING, METRIC_GATEWAY_IN_FLIGHT):
+            points = collector.points(metric)  # the last of a server stays
+            assert {one.attributes[ATTR_CONSUMER]: one.value for one in points} == {"a": 0, "b": 0}
 
 
 async def test_an_eviction_waits_for_a_stream_and_equals_take_turns(shared: GatewayProcess) -> None:
