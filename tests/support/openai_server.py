@@ -4,8 +4,8 @@
 and serves until SIGTERM.
 
 It sleeps and wakes as vLLM does. A chat says `max_tokens` words, each once a file named as the
-`user` of the body with the word's number appears in FOLDER, or at once without a `user`. Any other
-path answers what it was asked.
+`user` of the body with the word's number appears in FOLDER, or at once without a `user`. Asked with
+tools, it plans. Any other path answers what it was asked.
 """
 
 import asyncio
@@ -49,9 +49,13 @@ class OpenAiServer(StandIn):
         return web.Response()
 
     async def complete(self, request: web.Request) -> web.StreamResponse:
-        if (await request.json())["messages"][-1]["content"] == "die":
+        wanted = await request.json()
+        last = wanted["messages"][-1]
+        if last["content"] == "die":
             print("about to die", flush=True)
             os._exit(7)
+        if "tools" in wanted:
+            return web.json_response(planned(done=last["role"] == "tool"))
         return await super().complete(request)
 
     async def pause(self, wanted: JsonMap, first: int, count: int) -> None:
@@ -82,6 +86,15 @@ class OpenAiServer(StandIn):
             elif message.type is WSMsgType.BINARY:
                 await socket.send_bytes(message.data)
         return socket
+
+
+def planned(*, done: bool) -> object:
+    """Return what a planner says: to drive, and once it did, to finish."""
+    from tests.support.llm_apis import OpenAi
+
+    if done:
+        return OpenAi.says(("finish", '{"success": true, "reason": "here"}'))
+    return OpenAi.says(("execute_rskill__lab__go", "{}"))
 
 
 def main(folder: str, size: str, port: str) -> None:
