@@ -7,6 +7,7 @@ listens, and runs until SIGTERM. Its parts:
 - `turns`: which waiting request is next; pure.
 - `keys`: who asks, and for what it may; pure.
 - `program`: one model server under one lease, as a child `vramctl run --control`.
+- `logs`: what servers print, and its readers.
 - `server`: the states of one server, and the requests that wait for it.
 - `proxy`: bytes both ways, HTTP and WebSocket.
 - `front`: llama-swap's endpoints, limits, errors.

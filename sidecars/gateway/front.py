@@ -6,7 +6,7 @@ path goes to the server of the body's `model`, or to the only server.
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Final
 from urllib.parse import unquote
@@ -29,12 +29,16 @@ from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.urls import HttpAddress
 from vram_arbiter.sidecars.gateway import proxy
 from vram_arbiter.sidecars.gateway.keys import Asker, Keys
+from vram_arbiter.sidecars.gateway.logs import following
 from vram_arbiter.sidecars.gateway.reply import Reply, Sent, failure
 from vram_arbiter.sidecars.gateway.routing import finder_of, no_model
 from vram_arbiter.sidecars.gateway.server import Server, Turn
 
 OWNER: Final = "vram-gateway"
 UPSTREAM: Final = "/upstream/"
+LOGS_STREAM: Final = "/logs/stream"
+SLOW_S: Final = 10.0
+TOO_SLOW: Final = b"vram-gateway: lines were lost: they came faster than they were read\n"
 CONNECT_TRIES: Final = 10
 LOOK_BYTES: Final = 4096
 """Of a body, looked through at a time."""
@@ -80,6 +84,8 @@ class Front:
             asker = self._asker(request)
             if (own := self._own.get(request.path)) is not None:
                 return own(request, asker)
+            if f"{request.path}/".startswith(f"{LOGS_STREAM}/"):
+                return await self._follow_logs(request, asker)
             return await self._serve(request, asker)
         except VramError as error:
             return failure(error)
@@ -224,16 +230,26 @@ class Front:
     async def _turn(
         self, request: web.BaseRequest, server: Server, asker: Asker
     ) -> AsyncIterator[Turn]:
-        """Record a turn of the request: span, wait, duration."""
+        """Record a turn of the request: span, wait, duration, and that it waits or is in flight."""
         now = asyncio.get_running_loop().time
         labels = {telemetry.ATTR_CONSUMER: server.name}
         came, traceparent = now(), request.headers.get("traceparent")
         with tracing.span(telemetry.SPAN_GATEWAY_REQUEST, traceparent, labels):
-            async with server.turn(asker) as turn:
-                tracing.event(telemetry.EVENT_GRANTED)
-                granted = now()
-                meters.measure(telemetry.METRIC_GATEWAY_WAIT, granted - came, labels)
-                yield turn
+            awake, phase = server.state == "ready", telemetry.METRIC_GATEWAY_WAITING
+            meters.shift(phase, 1, labels)
+            try:
+                async with server.turn(asker) as turn:
+                    meters.shift(phase, -1, labels)
+                    phase = telemetry.METRIC_GATEWAY_IN_FLIGHT
+                    meters.shift(phase, 1, labels)
+                    if not awake:
+                        tracing.event(telemetry.EVENT_WOKEN)
+                    tracing.event(telemetry.EVENT_GRANTED)
+                    granted = now()
+                    meters.measure(telemetry.METRIC_GATEWAY_WAIT, granted - came, labels)
+                    yield turn
+            finally:
+                meters.shift(phase, -1, labels)
             meters.measure(telemetry.METRIC_GATEWAY_REQUEST, now() - granted, labels)
 
     # -- the gateway's own answers
@@ -267,14 +283,36 @@ class Front:
         return web.Response(text="OK")
 
     def _logs(self, request: web.BaseRequest, asker: Asker) -> web.Response:
-        lines = [
-            f"{server.name}: {line}\n"
-            for server in self._chosen(request, asker)
-            for line in server.log.lines
-        ]
-        return web.Response(text="".join(lines))
+        return web.Response(text=_history(self._chosen(request, asker)))
+
+    async def _follow_logs(self, request: web.BaseRequest, asker: Asker) -> web.StreamResponse:
+        """Send what servers printed, and print until the client leaves or falls behind."""
+        model = request.path.removeprefix(LOGS_STREAM).removeprefix("/")
+        servers = [self._server_of(model, asker)] if model else self._visible(asker)
+        response = web.StreamResponse(headers={"Content-Type": "text/plain; charset=utf-8"})
+        await response.prepare(request)
+        with following(server.log for server in servers) as reader:
+            text = b"" if "no-history" in request.query else _history(servers).encode()
+            while not reader.late:
+                await _write(response, text)
+                text = await reader.take()
+            await _write(response, text + TOO_SLOW)
+        return response
 
     def _chosen(self, request: web.BaseRequest, asker: Asker) -> list[Server]:
         """Return the servers that `?model=` names, or all. Raises UnknownModel."""
         model = request.query.get("model")
         return self._visible(asker) if model is None else [self._server_of(model, asker)]
+
+
+async def _write(response: web.StreamResponse, data: bytes) -> None:
+    """Send a part of an answer. Raises ConnectionAbortedError where it is not read for SLOW_S."""
+    try:
+        async with asyncio.timeout(SLOW_S):
+            await response.write(data)
+    except TimeoutError as error:
+        raise ConnectionAbortedError(f"nothing was read for {SLOW_S:g} s") from error
+
+
+def _history(servers: Iterable[Server]) -> str:
+    return "".join(server.log.text() for server in servers)

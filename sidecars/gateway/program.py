@@ -9,7 +9,6 @@ import json
 import os
 import socket
 import sys
-from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Final, Self
 
@@ -18,30 +17,14 @@ from vram_arbiter.clients.foreign.service import find_container, find_unit
 from vram_arbiter.schemas.config.gateway import ServerConfig
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.runtime.ports import free_port
-from vram_arbiter.schemas.runtime.printable import printable_lines
+from vram_arbiter.sidecars.gateway.logs import LINE_MAX_BYTES, Log
 from vram_arbiter.sidecars.gateway.upstream import Upstream
 
-LINES_MAX: Final = 1000
-LINE_MAX_BYTES: Final = 4096
-TAIL_LINES: Final = 12
 OUTPUT_S: Final = 1.0
 ASLEEP: Final = frozenset({"standby", "parked", "gone"})
 """States of a lease whose program holds no bytes."""
 LEAVING: Final = frozenset({"revoking", "unloading"}) | ASLEEP
 VRAMCTL: Final = (sys.executable, "-m", "vram_arbiter.clients")
-
-
-class Log:
-    """The last lines that a server printed."""
-
-    def __init__(self) -> None:
-        self.lines: deque[str] = deque(maxlen=LINES_MAX)
-
-    def add(self, line: bytes) -> None:
-        self.lines.append(printable_lines(line[:LINE_MAX_BYTES].decode(errors="replace").rstrip()))
-
-    def tail(self) -> str:
-        return "\n".join(list(self.lines)[-TAIL_LINES:])
 
 
 class Program:

@@ -31,7 +31,8 @@ from vram_arbiter.schemas.errors import (
     WaitTimeout,
 )
 from vram_arbiter.sidecars.gateway.keys import Asker
-from vram_arbiter.sidecars.gateway.program import ASLEEP, Log, Program, runs_already
+from vram_arbiter.sidecars.gateway.logs import Log
+from vram_arbiter.sidecars.gateway.program import ASLEEP, Program, runs_already
 from vram_arbiter.sidecars.gateway.turns import Request, Turns
 from vram_arbiter.sidecars.gateway.upstream import Upstream
 
@@ -78,7 +79,7 @@ class Server:
     def __init__(
         self, name: str, config: ServerConfig, client: AsyncClient, reserved: Mapping[str, int]
     ) -> None:
-        self.name, self.config, self.log = name, config, Log()
+        self.name, self.config, self.log = name, config, Log(name)
         self.switches = 0
         """How often its program was started or woken."""
         self._client = client

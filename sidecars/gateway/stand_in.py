@@ -12,25 +12,29 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Sequence
 from itertools import cycle, islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from aiohttp import web
 
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.defaults import RESIDUE_BYTES
 from vram_arbiter.schemas.fakegpu import SimulatedOutOfMemory
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.sizes import parse_bytes
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
 WORDS: Final = ("the", " arm", " moves", " to", " the", " cup", " and", " lifts", " it", ".")
-TOKENS: Final = 16
 
 
 class StandIn:
     """Answers of one model. `token_s`: pause before each word."""
+
+    words: ClassVar[Sequence[str]] = WORDS
+    tokens: ClassVar = 16
+    """Where a request does not limit them."""
 
     def __init__(self, name: str, token_s: float) -> None:
         self._name, self._token_s = name, token_s
@@ -39,7 +43,7 @@ class StandIn:
         app = web.Application()
         app.router.add_get("/health", self._health)
         app.router.add_get("/v1/models", self._models)
-        app.router.add_post("/v1/chat/completions", self._complete)
+        app.router.add_post("/v1/chat/completions", self.complete)
         return app
 
     async def _health(self, request: web.Request) -> web.Response:
@@ -49,27 +53,27 @@ class StandIn:
         models = [{"id": self._name, "object": "model", "owned_by": "stand-in"}]
         return web.json_response({"object": "list", "data": models})
 
-    async def _complete(self, request: web.Request) -> web.StreamResponse:
+    async def complete(self, request: web.Request) -> web.StreamResponse:
         wanted = await request.json()
-        count = int(wanted.get("max_tokens", TOKENS))
-        words = islice(cycle(WORDS), count)
+        count = int(wanted.get("max_tokens") or self.tokens)
+        words = islice(cycle(self.words), count)
         if not wanted.get("stream"):
-            await asyncio.sleep(self._token_s * count)
+            await self.pause(wanted, 0, count)
             answer = {"role": "assistant", "content": "".join(words)}
             return web.json_response(self._said("message", answer, "stop"))
         stream = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
         await stream.prepare(request)
-        for chunk in self._chunks(words):
-            if self._token_s:
-                await asyncio.sleep(self._token_s)
-            await stream.write(chunk)
+        for number, word in enumerate(words):
+            await self.pause(wanted, number, 1)
+            told = self._said("delta", {"content": word}, None)
+            await stream.write(f"data: {json.dumps(told)}\n\n".encode())
         await stream.write_eof(b"data: [DONE]\n\n")
         return stream
 
-    def _chunks(self, words: Iterator[str]) -> Iterator[bytes]:
-        for word in words:
-            told = self._said("delta", {"content": word}, None)
-            yield f"data: {json.dumps(told)}\n\n".encode()
+    async def pause(self, wanted: JsonMap, first: int, count: int) -> None:
+        """Wait for `count` words of the answer to `wanted`, from number `first` on."""
+        if self._token_s:
+            await asyncio.sleep(self._token_s * count)
 
     def _said(self, key: str, text: dict[str, str], end: str | None) -> dict[str, Any]:
         choice = {"index": 0, key: text, "finish_reason": end}

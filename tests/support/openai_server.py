@@ -1,44 +1,44 @@
-"""Stand-in for a server with OpenAI's API.
+"""The gateway's stand-in for a model server (`sidecars.gateway.stand_in`), with what tests need.
 
 `python -m tests.support.openai_server FOLDER BYTES PORT` holds bytes on the simulated GPU in FOLDER
 and serves until SIGTERM.
 
-It sleeps and wakes as vLLM does. A chat streams `max_tokens` words, one each time a file named as
-the `user` of the body with the word's number appears in FOLDER, or at once without a `user`.
+It sleeps and wakes as vLLM does. A chat says `max_tokens` words, each once a file named as the
+`user` of the body with the word's number appears in FOLDER, or at once without a `user`. Asked with
+tools, it plans. Any other path answers what it was asked.
 """
 
 import asyncio
-import json
 import os
-import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 from aiohttp import WSMsgType, web
 
 from tests.support.held_bytes import HeldBytes
+from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.sidecars.gateway.stand_in import StandIn
 
 POLL_S = 0.01
 
 
-class OpenAiServer:
+class OpenAiServer(StandIn):
+    words: ClassVar = tuple(f"{number} " for number in range(10))
+    tokens: ClassVar = 2
+
     def __init__(self, folder: Path, free: Callable[[], None], load: Callable[[], None]) -> None:
+        super().__init__("stand-in", 0.0)
         self.folder, self.free, self.load = folder, free, load
 
     def app(self) -> web.Application:
-        app = web.Application(client_max_size=1 << 30)
-        app.router.add_get("/health", self.health)
-        app.router.add_post("/v1/chat/completions", self.chat)
+        app = super().app()
         app.router.add_get("/ws", self.socket)
         app.router.add_post("/sleep", self.sleep)
         app.router.add_post("/wake_up", self.wake_up)
         app.router.add_route("*", "/{path:.*}", self.echo)
         return app
-
-    async def health(self, request: web.Request) -> web.Response:
-        return web.Response(text="ok")
 
     async def sleep(self, request: web.Request) -> web.Response:
         self.free()
@@ -48,31 +48,22 @@ class OpenAiServer:
         self.load()
         return web.Response()
 
-    async def chat(self, request: web.Request) -> web.StreamResponse:
-        body = await request.json()
-        count = int(body.get("max_tokens") or 2)
-        if body["messages"][-1]["content"] == "die":
+    async def complete(self, request: web.Request) -> web.StreamResponse:
+        wanted = await request.json()
+        last = wanted["messages"][-1]
+        if last["content"] == "die":
             print("about to die", flush=True)
             os._exit(7)
-        if not body.get("stream"):
-            await self.gate(body, 0)
-            return web.json_response(completion(body["model"], "word " * count, "message"))
-        response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
-        await response.prepare(request)
-        for number in range(count):
-            await self.gate(body, number)
-            chunk = completion(body["model"], f"{number} ", "delta")
-            await response.write(f"data: {json.dumps(chunk)}\n\n".encode())
-        await response.write(b"data: [DONE]\n\n")
-        return response
+        if "tools" in wanted:
+            return web.json_response(planned(done=last["role"] == "tool"))
+        return await super().complete(request)
 
-    async def gate(self, body: dict[str, Any], number: int) -> None:
-        if user := body.get("user"):
-            while not (self.folder / f"{user}.{number}").exists():
+    async def pause(self, wanted: JsonMap, first: int, count: int) -> None:
+        if user := wanted.get("user"):
+            while not (self.folder / f"{user}.{first}").exists():
                 await asyncio.sleep(POLL_S)
 
     async def echo(self, request: web.Request) -> web.Response:
-        data = await request.read()
         if request.path == "/large":
             return web.Response(body=b"x" * int(request.query["bytes"]))
         said = {
@@ -80,7 +71,7 @@ class OpenAiServer:
             "method": request.method,
             "target": request.raw_path,
             "headers": dict(request.headers),
-            "bytes": len(data),
+            "bytes": sum([len(data) async for data in request.content.iter_any()]),
         }
         return web.json_response(
             said, headers={"X-Own": "1", "Connection": "x-secret", "X-Secret": "1"}
@@ -97,26 +88,22 @@ class OpenAiServer:
         return socket
 
 
-def completion(model: str, words: str, part: str) -> dict[str, Any]:
-    choice = {"index": 0, part: {"role": "assistant", "content": words}, "finish_reason": None}
-    kind = "chat.completion" if part == "message" else "chat.completion.chunk"
-    return {"id": "1", "object": kind, "created": 1, "model": model, "choices": [choice]}
+def planned(*, done: bool) -> object:
+    """Return what a planner says: to drive, and once it did, to finish."""
+    from tests.support.llm_apis import OpenAi
 
-
-async def serve(server: OpenAiServer, port: int) -> None:
-    runner = web.AppRunner(server.app(), shutdown_timeout=0.1)
-    await runner.setup()
-    stop = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
-    await web.TCPSite(runner, "127.0.0.1", port).start()
-    print(f"serves on {port}", flush=True)
-    await stop.wait()
-    await runner.cleanup()
+    if done:
+        return OpenAi.says(("finish", '{"success": true, "reason": "here"}'))
+    return OpenAi.says(("execute_rskill__lab__go", "{}"))
 
 
 def main(folder: str, size: str, port: str) -> None:
     held = HeldBytes(folder, size)
-    asyncio.run(serve(OpenAiServer(Path(folder), held.free, held.load), int(port)))
+    app = OpenAiServer(Path(folder), held.free, held.load).app()
+    print(f"serves on {port}", flush=True)
+    web.run_app(
+        app, host="127.0.0.1", port=int(port), print=None, access_log=None, shutdown_timeout=0.1
+    )
     held.close()
 
 

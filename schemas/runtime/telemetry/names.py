@@ -50,6 +50,7 @@ EVENT_SENSOR_STALE = "vram.event.sensor_stale"
 EVENT_SAFETY_VIOLATION = "vram.event.safety_violation"
 EVENT_ACTION_WITHHELD = "vram.event.action_withheld"
 EVENT_ANSWER_REJECTED = "vram.event.answer_rejected"  # within reasoner.plan: asked again
+EVENT_WOKEN = "vram.event.woken"  # within gateway.request: its server was away when it came
 EVENT_GRANTED = "vram.event.granted"  # within gateway.request: its server can take it
 EVENT_FIRST_BYTE = "vram.event.first_byte"
 EVENT_PREFETCH_HIT = "vram.event.chunk_prefetch_hit"
@@ -116,6 +117,10 @@ METRIC_TOOL_CALLS = metric("vram_reasoner.tool_calls", "{call}", "Tool calls of 
 METRIC_SIDECAR_LOAD = metric("vram_sidecar.load.duration", "s", "One load onto the GPU", WAITS_S)
 METRIC_SIDECAR_REQUEST = metric("vram_sidecar.request.duration", "s", "One request", TICKS_S)
 METRIC_GATEWAY_WAIT = metric("vram_gateway.wait.duration", "s", "Wait for a server", WAITS_S)
+METRIC_GATEWAY_WAITING = metric("vram_gateway.requests.waiting", "{request}", "Requests that wait")
+METRIC_GATEWAY_IN_FLIGHT = metric(
+    "vram_gateway.requests.in_flight", "{request}", "Requests at their servers"
+)
 METRIC_GATEWAY_REQUEST = metric(
     "gen_ai.server.request.duration", "s", "A request from its server's grant to its end", WAITS_S
 )

@@ -10,7 +10,10 @@ from typing import Any
 
 import pytest
 
+from tests.sidecars.gateway.conftest import GatewayProcess
+from tests.sidecars.gateway.conftest import stand_in as stand_in_server
 from tests.support.llm_apis import Anthropic, OpenAi
+from tests.support.process import ArbiterProcess
 from vram_arbiter.reasoner.__main__ import _one_task, _serve, speak
 from vram_arbiter.reasoner.options import parser
 from vram_arbiter.reasoner.server import send
@@ -167,3 +170,35 @@ async def test_a_playbook_and_a_reward_model_reach_the_language_model(
     assert (result["steps"][0]["status"], result["reason"]) == ("answered", "a look")
     assert "Turn left first." in OpenAi.system(stand_in.asked[0])
     assert set(OpenAi.offered(stand_in.asked[0])) == {"query_task_progress", "finish"}
+
+
+@pytest.mark.e2e
+async def test_a_planner_whose_model_takes_turns_on_the_gpu_ends_its_task(
+    tmp_path: Path,
+    a_runner: Any,
+    arbiter_daemon: ArbiterProcess,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Behind the gateway the model leaves for another server while a goal runs, and comes back for
+    the next decision."""
+    servers = {name: stand_in_server(arbiter_daemon, 5) for name in ("llm", "other")}
+    config = {"listen": "127.0.0.1:0", "servers": servers}
+    gateway = await asyncio.to_thread(GatewayProcess, arbiter_daemon, config, tmp_path)
+    monkeypatch.setenv("VRAM_REASONER_LLM_BASE_URL", f"{gateway.url}/v1")
+    monkeypatch.setenv("VRAM_REASONER_LLM_MODEL", "llm")
+    try:
+        async with a_runner() as runner, asyncio.timeout(60):
+            runner.skills, runner.result_error = [GO], BadState("it runs")
+            task = asyncio.create_task(
+                _one_task(flags("--task", "drive home", "--planner", "openai"))
+            )
+            await runner.accepted.wait()
+            await asyncio.to_thread(gateway.client.get, "/upstream/other/x")
+            assert set(gateway.running()) == {"other"}
+            await runner.end()
+            result = await task
+            assert (result["status"], result["reason"]) == ("success", "here")
+            assert [step["status"] for step in result["steps"]] == ["succeeded"]
+            assert gateway.running()["llm"]["switches"] == 2
+    finally:
+        await asyncio.to_thread(gateway.close)

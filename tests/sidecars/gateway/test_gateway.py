@@ -19,6 +19,7 @@ pytest.importorskip("aiohttp", reason="the extra `gateway`")
 import aiohttp
 
 from tests.sidecars.gateway.conftest import KEY, PATIENCE_S, GatewayProcess, stand_in
+from tests.support.collector import Collector
 from tests.support.leases import view_of
 from tests.support.process import ArbiterProcess
 from tests.support.waiting import until
@@ -26,10 +27,20 @@ from vram_arbiter.clients.sync import Client
 from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.llm.http import JsonHttp
 from vram_arbiter.schemas.runtime import procfs
+from vram_arbiter.schemas.runtime.telemetry.names import (
+    ATTR_CONSUMER,
+    EVENT_FIRST_BYTE,
+    EVENT_GRANTED,
+    EVENT_WOKEN,
+    METRIC_GATEWAY_IN_FLIGHT,
+    METRIC_GATEWAY_WAITING,
+    SPAN_GATEWAY_REQUEST,
+)
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 Start = Callable[..., GatewayProcess]
 HELLO = [{"role": "user", "content": "hello"}]
+ANSWER = "0 1 "
 
 
 def openai_client(gateway: GatewayProcess, key: str = KEY) -> openai.AsyncOpenAI:
@@ -59,24 +70,37 @@ async def eventually(condition: Callable[[], object]) -> None:
 
 # -- a stock client
 async def test_the_first_request_starts_its_server_and_an_idle_one_leaves(
-    gateway: Start, arbiter_daemon: ArbiterProcess
+    gateway: Start, arbiter_daemon: ArbiterProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started = gateway(
-        {
-            "a": stand_in(arbiter_daemon, 3, models=["gpt-4o-mini"], idle_s=0.2),
-            "b": stand_in(arbiter_daemon, 3),
-        }
-    )
-    async with openai_client(started) as client:
-        models = [model.id async for model in client.models.list()]
-        assert models == ["a", "gpt-4o-mini", "b"]
-        assert not started.running()
-        assert await ask(client, "gpt-4o-mini") == "word word "
-        assert await ask(client, "b") == "word word "
-    await eventually(lambda: set(started.running()) == {"b"})  # both fit; `a` was idle
-    with Client("t", endpoint=arbiter_daemon.endpoint) as arbiter:
-        assert [lease.consumer for lease in arbiter.status().leases] == ["b"]
-    assert "a: serves on" in started.logs()
+    with Collector() as collector:
+        for name, value in collector.environ().items():
+            monkeypatch.setenv(name, value)
+        started = gateway(
+            {
+                "a": stand_in(arbiter_daemon, 3, models=["gpt-4o-mini"], idle_s=0.2),
+                "b": stand_in(arbiter_daemon, 3),
+            }
+        )
+        async with openai_client(started) as client:
+            models = [model.id async for model in client.models.list()]
+            assert models == ["a", "gpt-4o-mini", "b"]
+            assert not started.running()
+            assert await ask(client, "gpt-4o-mini") == ANSWER
+            assert await ask(client, "b") == ANSWER
+            assert await ask(client, "b") == ANSWER
+        await eventually(lambda: set(started.running()) == {"b"})  # both fit; `a` was idle
+        with Client("t", endpoint=arbiter_daemon.endpoint) as arbiter:
+            assert [lease.consumer for lease in arbiter.status().leases] == ["b"]
+        assert "a: serves on" in started.logs()
+        started.close()
+        asked = [
+            [event.name for event in span.events] for span in collector.spans(SPAN_GATEWAY_REQUEST)
+        ]
+        passed = [EVENT_GRANTED, EVENT_FIRST_BYTE]
+        assert asked == [[EVENT_WOKEN, *passed], [EVENT_WOKEN, *passed], passed]
+        for metric in (METRIC_GATEWAY_WAITING, METRIC_GATEWAY_IN_FLIGHT):
+            points = collector.points(metric)  # the last of a server stays
+            assert {one.attributes[ATTR_CONSUMER]: one.value for one in points} == {"a": 0, "b": 0}
 
 
 async def test_an_eviction_waits_for_a_stream_and_equals_take_turns(shared: GatewayProcess) -> None:
@@ -97,8 +121,8 @@ async def test_an_eviction_waits_for_a_stream_and_equals_take_turns(shared: Gate
             assert view_of(arbiter, "a").uses == 1
         shared.let("u", 1, 2)
         assert [chunk.choices[0].delta.content async for chunk in words] == ["1 ", "2 "]
-        assert await other == "word word "
-        assert await late == "word word "
+        assert await other == ANSWER
+        assert await late == ANSWER
 
 
 async def test_clients_of_two_servers_on_room_for_one_all_get_their_answers(
@@ -109,7 +133,7 @@ async def test_clients_of_two_servers_on_room_for_one_all_get_their_answers(
 
         async def user(name: str) -> None:
             for _ in range(3):
-                assert await ask(client, name) == "word word "
+                assert await ask(client, name) == ANSWER
 
         await asyncio.gather(*(user(name) for name in "ab" * 8))
     switches = {name: one["switches"] for name, one in started.running().items()}
@@ -188,7 +212,7 @@ async def test_a_request_that_does_not_end_is_ended_after_the_grace(
     async with openai_client(started) as client:
         stuck = asyncio.create_task(ask(client, "a", user="never"))
         await eventually(lambda: started.running().get("a", {}).get("in_flight") == 1)
-        assert await ask(client, "b") == "word word "
+        assert await ask(client, "b") == ANSWER
         with pytest.raises(openai.InternalServerError) as raised:
             await stuck
     assert raised.value.status_code == 503
@@ -214,10 +238,13 @@ async def test_a_server_that_dies_says_why_and_is_started_again(
         assert "exit code 5" in str(raised.value)
         assert "no such model" in str(raised.value)
         pid = await asyncio.to_thread(pid_of, started, "a")
-        with pytest.raises(openai.InternalServerError, match="about to die"):
-            await client.chat.completions.create(
-                model="a", messages=[{"role": "user", "content": "die"}]
-            )
+        with started.client.stream("GET", "/logs/stream/a?no-history") as followed:
+            with pytest.raises(openai.InternalServerError, match="about to die"):
+                await client.chat.completions.create(
+                    model="a", messages=[{"role": "user", "content": "die"}]
+                )
+            lines = followed.iter_lines()
+            assert await asyncio.to_thread(next, lines) == "a: about to die"
         await eventually(lambda: "a" not in started.running())
         assert await asyncio.to_thread(pid_of, started, "a") != pid
 
@@ -266,7 +293,7 @@ async def test_vramctl_run_listens_for_one_server_without_a_file(
     assert child.stdout is not None
     url = (await child.stdout.readline()).decode().strip()
     async with openai.AsyncOpenAI(base_url=f"{url}/v1", api_key=KEY, max_retries=0) as client:
-        assert await ask(client, "whatever") == "word word "
+        assert await ask(client, "whatever") == ANSWER
     child.terminate()
     assert await child.wait() == 0
 
@@ -292,7 +319,7 @@ async def test_beyond_the_queue_and_the_wait_the_reason_is_said(
         with pytest.raises(openai.InternalServerError) as late:
             await waits
         started.let("u", 0)
-        assert await stuck == "word word "
+        assert await stuck == ANSWER
     for raised, code in ((full, "limit_exceeded"), (late, "wait_timeout")):
         assert raised.value.status_code == 503
         assert raised.value.response.headers["retry-after"]
@@ -336,7 +363,7 @@ async def test_the_reasoners_planner_asks_again_where_it_was_told_to_wait(
         body: dict[str, Any] = {"model": "b", "messages": HELLO}
         answer = await http.post(f"{config.base_url}/chat/completions", body)
         await http.close()
-    assert answer["model"] == "b"
+    assert answer["choices"][0]["message"]["content"] == ANSWER
     assert pauses[0] == 5.0  # Retry-After
 
 
@@ -403,7 +430,7 @@ async def test_a_slow_reader_does_not_fill_memory(
         pieces = response.aiter_raw(65536)
         count = len(await anext(pieces))
         async with openai_client(started) as other:
-            assert await ask(other, "a") == "word word "  # others are served meanwhile
+            assert await ask(other, "a") == ANSWER  # others are served meanwhile
         assert rss_bytes(started.process.pid) - before < 32 << 20
         async for piece in pieces:
             count += len(piece)
@@ -425,6 +452,6 @@ async def test_a_websocket_passes_and_does_not_keep_its_server(shared: GatewayPr
         await socket.send_bytes(b"\0" * 100_000)
         assert len(await socket.receive_bytes()) == 100_000
         async with openai_client(shared) as client:
-            assert await ask(client, "b") == "word word "
+            assert await ask(client, "b") == ANSWER
         with contextlib.suppress(ConnectionError):
             assert (await socket.receive()).type is aiohttp.WSMsgType.CLOSE
