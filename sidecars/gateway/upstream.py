@@ -25,7 +25,9 @@ _HEAD: Final = re.compile(
     rb"(?:%b)*+" % _FIELD.pattern,
     re.ASCII,
 )
-_SIZE: Final = re.compile(rb"([0-9A-Fa-f]{1,15})[ \t]*(?:;[^\r\n]*)?\r\n")
+_SIZE: Final = re.compile(rb"(?:\r\n)?([0-9A-Fa-f]{1,15})[ \t]*(?:;[^\r\n]*)?\r\n")
+"""Behind the end of the chunk before."""
+_TRAILER: Final = re.compile(rb"[^\r\n]*\r\n")
 
 type Field = tuple[bytes, bytes]
 
@@ -61,39 +63,33 @@ class Chunked:
         self.over, self.spare, self.bounded = False, False, True
         self._decoded = decoded
         self._left = 0  # of a chunk
-        self._line = b""  # of a size or a trailer, as far as it is here
+        self._line = b""  # a size or a trailer that is not whole yet
         self._ending = False  # the last chunk was there
 
     def take(self, data: bytes) -> bytes:
         """As `Counted.take`. Raises SidecarUnavailable."""
-        at, parts = 0, []
+        at, known, parts = 0, len(self._line), []
+        data, self._line = self._line + data, b""
         while at < len(data) and not self.over:
             if self._left:
                 end = min(at + self._left, len(data))
                 if self._decoded:
                     parts.append(data[at:end])
                 self._left -= end - at
+            elif (found := (_TRAILER if self._ending else _SIZE).match(data, at)) is not None:
+                end = found.end()
+                if self._ending:
+                    self.over = found[0] == b"\r\n"
+                else:
+                    self._left = int(found[1], 16)
+                    self._ending = not self._left
+            elif b"\n" in data[at + 2 :] or len(data) - at > HIGH_BYTES:
+                raise malformed("a chunk has no size")
             else:
-                end = data.find(b"\n", at) + 1 or len(data)
-                self._line += data[at:end]
-                if self._line.endswith(b"\n"):
-                    self._take_line(self._line)
-                    self._line = b""
-                elif len(self._line) > HIGH_BYTES:
-                    raise malformed("a chunk's size is too long")
+                self._line, end = data[at:], len(data)
             at = end
         self.spare = at < len(data)
-        return b"".join(parts) if self._decoded else data[:at]
-
-    def _take_line(self, line: bytes) -> None:
-        if self._ending:
-            self.over = line == b"\r\n"
-        elif line != b"\r\n":  # the end of the chunk before
-            found = _SIZE.fullmatch(line)
-            if found is None:
-                raise malformed("a chunk has no size")
-            self._left = int(found[1], 16)
-            self._ending = not self._left
+        return b"".join(parts) if self._decoded else data[known:at]
 
 
 type Body = Counted | Chunked
