@@ -28,12 +28,13 @@ from vram_arbiter.clients.net.request import ask
 from vram_arbiter.schemas.config.gateway import load_gateway, load_keys
 from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
 from vram_arbiter.schemas.runtime import procfs
+from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
 from vram_arbiter.schemas.wire.requests import Status
 
 UNIT: Final = "vram-gateway.service"
-CONFIG, KEYS = "gateway.yaml", "gateway-keys.yaml"
+CONFIG, KEYS, ENVIRON = "gateway.yaml", "gateway-keys.yaml", "gateway.env"
 ASK_S, COMMAND_S = 2.0, 20.0
 ANSWER_MAX_BYTES: Final = 1 << 20
 MODELS_MAX: Final = 64
@@ -130,30 +131,27 @@ def listening(proc: Path = procfs.PROC) -> frozenset[int]:
 
 
 def units() -> list[Server]:
-    """Return the services of systemd that start a model server; those of the calling user, too."""
-    found: dict[str, Server] = {}
-    for user in ((), ("--user",)) if os.getuid() else ((),):
-        listed = _said(
-            "systemctl", *user, "list-unit-files", "--type=service", "--plain", "--no-legend"
-        )
-        names = [
-            line.split()[0] for line in listed.splitlines() if line.strip() and "@." not in line
-        ]
-        wanted_ = "--property=Id,ExecStart,ControlGroup"
-        shown = _said("systemctl", *user, "show", wanted_, "--", *names) if names else ""
-        for block in shown.split("\n\n"):
-            facts = dict(line.split("=", 1) for line in block.splitlines() if "=" in line)
-            command = " ".join(re.findall(r"argv\[\]=(.*?) ; ", facts.get("ExecStart", "")))
-            if kind := kind_of(command):
-                server = Server(kind, "unit", facts["Id"], port_of(kind, command), command)
-                found[facts["Id"]] = replace(server, cgroup=facts.get("ControlGroup", ""))
-    return list(found.values())
+    """Return the services of systemd that start a model server: root's are the machine's, another
+    user's its own."""
+    control = ("systemctl", *(("--user",) if os.getuid() else ()))
+    listed = _said(*control, "list-unit-files", "--type=service", "--plain", "--no-legend")
+    names = [line.split()[0] for line in listed.splitlines() if line.strip() and "@." not in line]
+    asked_for = "--property=Id,ExecStart,ControlGroup"
+    found = []
+    for block in _said(*control, "show", asked_for, "--", *names).split("\n\n") if names else ():
+        facts = dict(line.split("=", 1) for line in block.splitlines() if "=" in line)
+        command = " ".join(re.findall(r"argv\[\]=(.*?) ; ", facts.get("ExecStart", "")))
+        if kind := kind_of(command):
+            place = port_of(kind, command), command, facts.get("ControlGroup", "")
+            found.append(Server(kind, "unit", facts["Id"], *place))
+    return found
 
 
 def containers() -> list[Server]:
-    """Return the containers of podman and docker that hold a model server."""
+    """Return the containers of podman and docker that hold a model server. Root's unit cannot run
+    podman within its limits."""
     found = []
-    for engine in filter(shutil.which, ("podman", "docker")):
+    for engine in filter(shutil.which, ("podman", "docker") if os.getuid() else ("docker",)):
         listed = _said(engine, "container", "ls", "--all", "--quiet", "--no-trunc").split()
         said = _said(engine, "container", "inspect", "--", *listed) if listed else ""
         for one in json.loads(said) if said else ():
@@ -271,9 +269,10 @@ def config_text(found: Found, keys_file: Path) -> str:
         name = _free_name(server.name, servers)
         told = f"{name}: {server.kind}, port {server.port}"
         if server.where == "pid":
-            lines.append(
-                f"{told}, was started by hand: make it a unit or a `command` ({server.command})"
+            reason = (
+                "is no unit or container that this gateway may start: make it one, or a `command`"
             )
+            lines.append(f"{told}, {reason} ({server.command})")
         elif not server.held_bytes:
             lines.append(f"{told}: nothing of it is on a GPU; start it, and run setup again")
         else:
@@ -320,10 +319,10 @@ def run(args: argparse.Namespace) -> int:
     if args.dry_run:
         print(text, end="")
         return 0
-    return install(site, text, force=args.force)
+    return install(site, text, args.endpoint, force=args.force)
 
 
-def install(site: Site, text: str, *, force: bool) -> int:
+def install(site: Site, text: str, endpoint: str | None, *, force: bool) -> int:
     """Write the files and start the service; print the address and what clients set. Return the
     exit code of systemctl. Raises ConfigError."""
     path, keys = site.settings / CONFIG, site.settings / KEYS
@@ -345,6 +344,8 @@ def install(site: Site, text: str, *, force: bool) -> int:
     if not keys.exists():  # clients show those that are there
         key = {"name": "setup", "key": f"sk-{secrets.token_urlsafe(32)}"}
         _write(keys, yaml.safe_dump({"keys": [key]}))
+    if endpoint and not (environ := site.settings / ENVIRON).exists():
+        _write(environ, f"{ENDPOINT_VARIABLE}={endpoint}\n")
     token = load_keys(keys.read_text(encoding="utf-8"), str(keys)).keys[0].key.get_secret_value()
     print(f"written: {path}, {keys}\nhttp://{listen}")
     print(f"export OPENAI_BASE_URL=http://{listen}/v1\nexport OPENAI_API_KEY={token}", flush=True)
