@@ -26,7 +26,7 @@ from vram_arbiter.schemas.runtime import procfs
 
 ENGINES: Final = ("podman", "docker")
 ASK_S: Final = 10.0
-LOOK_S: Final = 0.1
+LOOK_S: Final = 0.2
 LOG_LINES: Final = 20
 ENDING: Final = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGQUIT, signal.SIGHUP})
 

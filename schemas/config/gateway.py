@@ -40,9 +40,9 @@ class ServerConfig(_Section):
     """Program and arguments, a child of the gateway, started without a shell. `{port}` stands for
     the port on which it shall listen on 127.0.0.1."""
     unit: Annotated[str, Field(pattern=UNIT_NAME)] | None = None
-    """A service of the gateway's user's systemd, else of the machine's. It needs `port`."""
+    """Name of a service of the user's systemd, else of the machine's. It needs `port`."""
     container: Annotated[str, Field(pattern=CONTAINER_NAME)] | None = None
-    """A container of podman or docker that exists. It needs `port`."""
+    """Name of a container of podman or docker, which exists. It needs `port`."""
     vram: ByteSize
     """Bytes that it takes at its peak, as `vramctl calibrate` measures them."""
     models: Annotated[tuple[Model, ...], Field(max_length=256)] = ()
