@@ -16,7 +16,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -95,12 +95,14 @@ class Server:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Everything that was looked at. `taken`: ports on which something listens."""
+    """Everything that was looked at. `taken`: ports on which something listens; `listen`: the
+    address of a configuration that is there."""
 
     gpus: Sequence[Mapping[str, Any]]
     servers: Sequence[Server]
     taken: frozenset[int]
-    programs: Sequence[str] = field(default=())
+    programs: Sequence[str] = ()
+    listen: str = ""
 
 
 # -- looking
@@ -220,8 +222,9 @@ def measured(server: Server, gpus: Sequence[Mapping[str, Any]]) -> Server:
 
 
 def kind_of(command: str) -> str:
-    """Return the kind of a command line; "" for another program's."""
-    return next((name for name, kind in KINDS.items() if re.search(kind.words, command)), "")
+    """Return the kind of a command line; "" for another program's, and for one under a lease."""
+    kinds = () if "vramctl run" in command else KINDS.items()
+    return next((name for name, kind in kinds if re.search(kind.words, command)), "")
 
 
 def port_of(kind: str, command: str) -> int:
@@ -260,9 +263,10 @@ def config_text(found: Found, keys_file: Path) -> str:
     """Return gateway.yaml. A server that cannot be configured is a comment with the reason."""
     used = {server.port for server in found.servers} | found.taken
     port = next(port for port in PORTS if port not in used)
+    listen = found.listen or f"127.0.0.1:{port}"
     gpus = [f"{gpu['name']} ({format_bytes(gpu['capacity_bytes'])})" for gpu in found.gpus]
     lines = ["Written by `vram-gateway setup`.", *(f"GPU: {gpu}" for gpu in gpus)]
-    config: dict[str, Any] = {"listen": f"127.0.0.1:{port}", "keys_file": str(keys_file)}
+    config: dict[str, Any] = {"listen": listen, "keys_file": str(keys_file)}
     servers: dict[str, Any] = {}
     models: set[str] = set()
     for server in found.servers:
@@ -315,11 +319,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Raises ArbiterUnreachable and ConfigError."""
     site = SYSTEM if os.getuid() == 0 else site_of_user(os.environ)
-    text = config_text(looked(args.endpoint), site.settings / KEYS)
+    found = with_kept(looked(args.endpoint), site.settings / CONFIG)
+    text = config_text(found, site.settings / KEYS)
     if args.dry_run:
         print(text, end="")
         return 0
     return install(site, text, args.endpoint, force=args.force)
+
+
+def with_kept(found: Found, path: Path) -> Found:
+    """Return what was found, with the address and the servers' bytes of a configuration that is
+    there: clients know the address, and a server that is away or under its lease holds nothing
+    itself. Raises ConfigError."""
+    if not path.exists():
+        return found
+    before = load_gateway(path.read_text(encoding="utf-8"), str(path))
+    sizes = {one.unit or one.container: one.vram for one in before.servers.values()}
+    servers = [
+        replace(one, held_bytes=one.held_bytes or sizes.get(one.name, 0)) for one in found.servers
+    ]
+    return replace(found, servers=servers, listen=before.listen)
 
 
 def install(site: Site, text: str, endpoint: str | None, *, force: bool) -> int:

@@ -64,6 +64,7 @@ def test_units_that_start_a_model_server_are_found_by_their_command(programs: Pa
             ("router.service", "/usr/bin/llama-server --port=9000", ""),
             ("comfy.service", "/opt/c/bin/python /opt/ComfyUI/main.py", ""),
             ("ssh.service", "/usr/sbin/sshd -D", "/system.slice/ssh.service"),
+            ("leased.service", "/usr/bin/vramctl run --vram 1GiB -- vllm serve m", ""),
         )
     )
     listed = "ollama.service enabled\nvllm@.service static\nssh.service enabled\n"
@@ -267,6 +268,11 @@ def test_files_are_private_a_unit_is_written_and_nothing_is_overwritten(
         f"--user enable {setup.UNIT}",
         f"--user restart {setup.UNIT}",
     ]
+    away = Found([GPU], [replace(OLLAMA, held_bytes=0)], frozenset({8000}))
+    kept = setup.with_kept(away, path)
+    assert (kept.servers, kept.listen) == ([OLLAMA], "127.0.0.1:8000"), "it is the gateway there"
+    assert config_text(kept, keys) == text_for(site)
+    assert setup.with_kept(away, keys.with_name("none")) == away
     with pytest.raises(ConfigError, match=r"gateway\.yaml exists") as refused:
         setup.install(site, text_for(site), ENDPOINT, force=False)
     assert "--force" in str(refused.value.hint)
