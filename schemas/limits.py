@@ -40,3 +40,6 @@ NAME: Final = Limits(min_length=1, max_length=d.NAME_MAX_CHARS, pattern=r"^[^\x0
 Name = Annotated[str, NAME]
 Bytes = Annotated[int, Limits(ge=0, le=1 << 50)]
 Seconds = Annotated[float, Limits(ge=0, le=86_400 * 365, allow_inf_nan=False)]
+UNIT_NAME: Final = r"^[A-Za-z0-9:_.\\@][A-Za-z0-9:_.\\@-]{0,254}$"
+CONTAINER_NAME: Final = "^[A-Za-z0-9][A-Za-z0-9_.-]{0,254}$"
+"""Names that may be arguments of systemctl, and of podman and docker."""

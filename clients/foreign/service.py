@@ -21,13 +21,12 @@ from typing import Any, Final
 
 from vram_arbiter.clients.foreign.say import say
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.limits import CONTAINER_NAME, UNIT_NAME
 from vram_arbiter.schemas.runtime import procfs
 
-UNIT: Final = r"[A-Za-z0-9:_.\\@][A-Za-z0-9:_.\\@-]{0,254}"
-CONTAINER: Final = "[A-Za-z0-9][A-Za-z0-9_.-]{0,254}"
 ENGINES: Final = ("podman", "docker")
 ASK_S: Final = 10.0
-LOOK_S: Final = 0.1
+LOOK_S: Final = 0.2
 LOG_LINES: Final = 20
 ENDING: Final = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGQUIT, signal.SIGHUP})
 
@@ -144,7 +143,7 @@ async def _call(command: Sequence[str], *, quiet: bool = False) -> int:
 # -- by name
 def find_unit(name: str) -> Service:
     """Return a service of the calling user's systemd, else of the machine's. Raises ConfigError."""
-    _check_name(name, UNIT)
+    _check_name(name, UNIT_NAME)
     users = [] if os.getuid() == 0 else [("systemctl", "--user")]
     for program in (*users, ("systemctl", "--no-ask-password")):
         shown = _shown(program, name)
@@ -179,7 +178,7 @@ def find_container(name: str, grace_s: float | None) -> Service:
 
     `grace_s`: from its stop signal to SIGKILL; None: the engine's own.
     """
-    _check_name(name, CONTAINER)
+    _check_name(name, CONTAINER_NAME)
     for engine in filter(shutil.which, ENGINES):
         if (found := _inspected(engine, name)) is not None:
             grace = () if grace_s is None else (f"--time={ceil(grace_s)}",)
@@ -208,7 +207,7 @@ def _slice(program: Sequence[str], name: str) -> str:
 
 def _check_name(name: str, pattern: str) -> None:
     if not re.fullmatch(pattern, name):
-        raise ConfigError(f"not a name: {name!r}", hint=f"expected {pattern}")
+        raise ConfigError(f"not a name: {name!r}", hint=f"expected one that matches {pattern}")
 
 
 def _shown(program: Sequence[str], name: str) -> dict[str, str]:

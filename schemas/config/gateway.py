@@ -8,6 +8,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, field_validator, model_validator
 
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.limits import CONTAINER_NAME, UNIT_NAME
 from vram_arbiter.schemas.units import ByteSize
 from vram_arbiter.schemas.urls import http_address
 from vram_arbiter.schemas.yamltext import parse_yaml, validated, without_empty
@@ -38,10 +39,10 @@ class ServerConfig(_Section):
     command: Annotated[tuple[Argument, ...], Field(max_length=256)] = ()
     """Program and arguments, a child of the gateway, started without a shell. `{port}` stands for
     the port on which it shall listen on 127.0.0.1."""
-    unit: Annotated[str, Field(max_length=255)] | None = None
-    """A service of the gateway's user's systemd, else of the machine's. It needs `port`."""
-    container: Annotated[str, Field(max_length=255)] | None = None
-    """A container of podman or docker that exists. It needs `port`."""
+    unit: Annotated[str, Field(pattern=UNIT_NAME)] | None = None
+    """Name of a service of the user's systemd, else of the machine's. It needs `port`."""
+    container: Annotated[str, Field(pattern=CONTAINER_NAME)] | None = None
+    """Name of a container of podman or docker, which exists. It needs `port`."""
     vram: ByteSize
     """Bytes that it takes at its peak, as `vramctl calibrate` measures them."""
     models: Annotated[tuple[Model, ...], Field(max_length=256)] = ()

@@ -16,7 +16,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,12 +28,13 @@ from vram_arbiter.clients.net.request import ask
 from vram_arbiter.schemas.config.gateway import load_gateway, load_keys
 from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
 from vram_arbiter.schemas.runtime import procfs
+from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
 from vram_arbiter.schemas.wire.requests import Status
 
 UNIT: Final = "vram-gateway.service"
-CONFIG, KEYS = "gateway.yaml", "gateway-keys.yaml"
+CONFIG, KEYS, ENVIRON = "gateway.yaml", "gateway-keys.yaml", "gateway.env"
 ASK_S, COMMAND_S = 2.0, 20.0
 ANSWER_MAX_BYTES: Final = 1 << 20
 MODELS_MAX: Final = 64
@@ -94,12 +95,14 @@ class Server:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Everything that was looked at. `taken`: ports on which something listens."""
+    """Everything that was looked at. `taken`: ports on which something listens; `listen`: the
+    address of a configuration that is there."""
 
     gpus: Sequence[Mapping[str, Any]]
     servers: Sequence[Server]
     taken: frozenset[int]
-    programs: Sequence[str] = field(default=())
+    programs: Sequence[str] = ()
+    listen: str = ""
 
 
 # -- looking
@@ -130,30 +133,27 @@ def listening(proc: Path = procfs.PROC) -> frozenset[int]:
 
 
 def units() -> list[Server]:
-    """Return the services of systemd that start a model server; those of the calling user, too."""
-    found: dict[str, Server] = {}
-    for user in ((), ("--user",)) if os.getuid() else ((),):
-        listed = _said(
-            "systemctl", *user, "list-unit-files", "--type=service", "--plain", "--no-legend"
-        )
-        names = [
-            line.split()[0] for line in listed.splitlines() if line.strip() and "@." not in line
-        ]
-        wanted_ = "--property=Id,ExecStart,ControlGroup"
-        shown = _said("systemctl", *user, "show", wanted_, "--", *names) if names else ""
-        for block in shown.split("\n\n"):
-            facts = dict(line.split("=", 1) for line in block.splitlines() if "=" in line)
-            command = " ".join(re.findall(r"argv\[\]=(.*?) ; ", facts.get("ExecStart", "")))
-            if kind := kind_of(command):
-                server = Server(kind, "unit", facts["Id"], port_of(kind, command), command)
-                found[facts["Id"]] = replace(server, cgroup=facts.get("ControlGroup", ""))
-    return list(found.values())
+    """Return the services of systemd that start a model server: root's are the machine's, another
+    user's its own."""
+    control = ("systemctl", *(("--user",) if os.getuid() else ()))
+    listed = _said(*control, "list-unit-files", "--type=service", "--plain", "--no-legend")
+    names = [line.split()[0] for line in listed.splitlines() if line.strip() and "@." not in line]
+    asked_for = "--property=Id,ExecStart,ControlGroup"
+    found = []
+    for block in _said(*control, "show", asked_for, "--", *names).split("\n\n") if names else ():
+        facts = dict(line.split("=", 1) for line in block.splitlines() if "=" in line)
+        command = " ".join(re.findall(r"argv\[\]=(.*?) ; ", facts.get("ExecStart", "")))
+        if kind := kind_of(command):
+            place = port_of(kind, command), command, facts.get("ControlGroup", "")
+            found.append(Server(kind, "unit", facts["Id"], *place))
+    return found
 
 
 def containers() -> list[Server]:
-    """Return the containers of podman and docker that hold a model server."""
+    """Return the containers of podman and docker that hold a model server. Root's unit cannot run
+    podman within its limits."""
     found = []
-    for engine in filter(shutil.which, ("podman", "docker")):
+    for engine in filter(shutil.which, ("podman", "docker") if os.getuid() else ("docker",)):
         listed = _said(engine, "container", "ls", "--all", "--quiet", "--no-trunc").split()
         said = _said(engine, "container", "inspect", "--", *listed) if listed else ""
         for one in json.loads(said) if said else ():
@@ -222,8 +222,9 @@ def measured(server: Server, gpus: Sequence[Mapping[str, Any]]) -> Server:
 
 
 def kind_of(command: str) -> str:
-    """Return the kind of a command line; "" for another program's."""
-    return next((name for name, kind in KINDS.items() if re.search(kind.words, command)), "")
+    """Return the kind of a command line; "" for another program's, and for one under a lease."""
+    kinds = () if "vramctl run" in command else KINDS.items()
+    return next((name for name, kind in kinds if re.search(kind.words, command)), "")
 
 
 def port_of(kind: str, command: str) -> int:
@@ -262,18 +263,20 @@ def config_text(found: Found, keys_file: Path) -> str:
     """Return gateway.yaml. A server that cannot be configured is a comment with the reason."""
     used = {server.port for server in found.servers} | found.taken
     port = next(port for port in PORTS if port not in used)
+    listen = found.listen or f"127.0.0.1:{port}"
     gpus = [f"{gpu['name']} ({format_bytes(gpu['capacity_bytes'])})" for gpu in found.gpus]
     lines = ["Written by `vram-gateway setup`.", *(f"GPU: {gpu}" for gpu in gpus)]
-    config: dict[str, Any] = {"listen": f"127.0.0.1:{port}", "keys_file": str(keys_file)}
+    config: dict[str, Any] = {"listen": listen, "keys_file": str(keys_file)}
     servers: dict[str, Any] = {}
     models: set[str] = set()
     for server in found.servers:
         name = _free_name(server.name, servers)
         told = f"{name}: {server.kind}, port {server.port}"
         if server.where == "pid":
-            lines.append(
-                f"{told}, was started by hand: make it a unit or a `command` ({server.command})"
+            reason = (
+                "is no unit or container that this gateway may start: make it one, or a `command`"
             )
+            lines.append(f"{told}, {reason} ({server.command})")
         elif not server.held_bytes:
             lines.append(f"{told}: nothing of it is on a GPU; start it, and run setup again")
         else:
@@ -316,14 +319,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Raises ArbiterUnreachable and ConfigError."""
     site = SYSTEM if os.getuid() == 0 else site_of_user(os.environ)
-    text = config_text(looked(args.endpoint), site.settings / KEYS)
+    found = with_kept(looked(args.endpoint), site.settings / CONFIG)
+    text = config_text(found, site.settings / KEYS)
     if args.dry_run:
         print(text, end="")
         return 0
-    return install(site, text, force=args.force)
+    return install(site, text, args.endpoint, force=args.force)
 
 
-def install(site: Site, text: str, *, force: bool) -> int:
+def with_kept(found: Found, path: Path) -> Found:
+    """Return what was found, with the address and the servers' bytes of a configuration that is
+    there: clients know the address, and a server that is away or under its lease holds nothing
+    itself. Raises ConfigError."""
+    if not path.exists():
+        return found
+    before = load_gateway(path.read_text(encoding="utf-8"), str(path))
+    sizes = {one.unit or one.container: one.vram for one in before.servers.values()}
+    servers = [
+        replace(one, held_bytes=one.held_bytes or sizes.get(one.name, 0)) for one in found.servers
+    ]
+    return replace(found, servers=servers, listen=before.listen)
+
+
+def install(site: Site, text: str, endpoint: str | None, *, force: bool) -> int:
     """Write the files and start the service; print the address and what clients set. Return the
     exit code of systemctl. Raises ConfigError."""
     path, keys = site.settings / CONFIG, site.settings / KEYS
@@ -345,6 +363,8 @@ def install(site: Site, text: str, *, force: bool) -> int:
     if not keys.exists():  # clients show those that are there
         key = {"name": "setup", "key": f"sk-{secrets.token_urlsafe(32)}"}
         _write(keys, yaml.safe_dump({"keys": [key]}))
+    if endpoint and not (environ := site.settings / ENVIRON).exists():
+        _write(environ, f"{ENDPOINT_VARIABLE}={endpoint}\n")
     token = load_keys(keys.read_text(encoding="utf-8"), str(keys)).keys[0].key.get_secret_value()
     print(f"written: {path}, {keys}\nhttp://{listen}")
     print(f"export OPENAI_BASE_URL=http://{listen}/v1\nexport OPENAI_API_KEY={token}", flush=True)

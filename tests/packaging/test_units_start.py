@@ -327,10 +327,7 @@ def test_setup_puts_a_unit_under_a_lease_which_stops_and_starts_it(machine: Mach
 
     answer_of(lambda: read()[1] or None, log)
     setup = ("/opt/vram-arbiter/bin/vram-gateway", "setup", "--endpoint", ENDPOINT)
-    text = machine.run(*setup, "--dry-run")
-    assert "unit: llm.service" in text
     said = machine.run(*setup).splitlines()
-    assert machine.read("/etc/vram-arbiter/gateway.yaml") == text
     port, key = said[1].rpartition(":")[2], said[3].partition("=")[2]
 
     leases, process = answer_of(
@@ -350,7 +347,7 @@ def test_setup_puts_a_unit_under_a_lease_which_stops_and_starts_it(machine: Mach
     settings = "/etc/vram-arbiter"
     for path in (f"{SYSTEM}/{SERVED}", "/usr/local/bin/llama-server"):
         machine.run("rm", path)
-    machine.run("rm", f"{settings}/gateway.yaml", f"{settings}/gateway-keys.yaml")
+    machine.run("sh", "-c", f"rm {settings}/gateway*")
     machine.run("systemctl", "daemon-reload")
 
 

@@ -179,7 +179,7 @@ def test_a_user_installs_upgrades_and_removes(
     assert systemctl.read_text() == "--user daemon-reload\n"
     systemctl.unlink()
     assert run_main(["uninstall", "--user-units", "--yes"]) == 0
-    names = "vram-reasoner.service vram-arbiter.service"
+    names = "vram-gateway.service vram-reasoner.service vram-arbiter.service"
     assert systemctl.read_text().splitlines() == [
         f"--user stop {names}", f"--user disable {names}", "--user daemon-reload",
     ]  # fmt: skip

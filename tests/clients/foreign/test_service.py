@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from vram_arbiter.clients.cli.main import run_main
 from vram_arbiter.clients.foreign.service import Service, ServiceProgram, find_container, find_unit
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime import procfs
@@ -147,6 +148,25 @@ def test_what_is_not_there_is_said(machine: Path) -> None:
             find_unit(name)
     with pytest.raises(ConfigError, match="neither podman nor docker knows a container 'llm'"):
         find_container("llm", None)
+
+
+@pytest.mark.parametrize(
+    "words", [["--unit", "a", "--", "b"], ["--unit", "a", "--container", "b"], []]
+)
+def test_one_thing_is_run_and_no_other(
+    machine: Path, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run_main(["run", "--vram", "1GiB", *words])
+    assert ended.value.code == 2
+    assert "or --unit NAME, or --container NAME" in capsys.readouterr().err
+
+
+def test_a_unit_that_is_not_there_is_wrong_use(
+    machine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_main(["run", "--vram", "1GiB", "--unit", "llm"]) == 2
+    assert "there is no service 'llm'" in capsys.readouterr().err
 
 
 # -- running

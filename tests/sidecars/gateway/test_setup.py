@@ -14,17 +14,20 @@ from typing import Any
 
 import pytest
 
+from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.cli.installation.site import Site, site_of_user
 from vram_arbiter.schemas.config.gateway import load_gateway, load_keys
 from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.sidecars.gateway import setup
+from vram_arbiter.sidecars.gateway.__main__ import main
 from vram_arbiter.sidecars.gateway.setup import Found, Server, config_text
 
 GIB = 1 << 30
 KEYS_FILE = Path("/etc/vram-arbiter/gateway-keys.yaml")
 GPU = {"gpu": "GPU-0", "name": "RTX", "capacity_bytes": 8 * GIB, "processes": []}
 OLLAMA = Server("ollama", "unit", "ollama.service", 11434, on_evict="ollama", held_bytes=3 * GIB)
+ENDPOINT = "ipc:///run/vram-arbiter/arbiter.sock"
 EXEC = "{{ path={0} ; argv[]={1} ; ignore_errors=no ; start_time=[n/a] }}"
 
 
@@ -61,6 +64,7 @@ def test_units_that_start_a_model_server_are_found_by_their_command(programs: Pa
             ("router.service", "/usr/bin/llama-server --port=9000", ""),
             ("comfy.service", "/opt/c/bin/python /opt/ComfyUI/main.py", ""),
             ("ssh.service", "/usr/sbin/sshd -D", "/system.slice/ssh.service"),
+            ("leased.service", "/usr/bin/vramctl run --vram 1GiB -- vllm serve m", ""),
         )
     )
     listed = "ollama.service enabled\nvllm@.service static\nssh.service enabled\n"
@@ -211,7 +215,9 @@ def test_the_file_has_what_is_known_and_comments_for_the_rest() -> None:
     assert (big.container, big.vram, big.models) == ("big", 5 * GIB + (64 << 20), ("Q",))
     comments = [line for line in text.splitlines() if line.startswith("#")]
     assert "# GPU: RTX (8 GiB)" in comments
-    assert any("was started by hand" in line and "llama-server -m x" in line for line in comments)
+    assert any(
+        "is no unit or container" in line and "llama-server -m x" in line for line in comments
+    )
     assert any(
         line.startswith("# comfy: ") and "nothing of it is on a GPU" in line for line in comments
     )
@@ -245,8 +251,9 @@ def test_files_are_private_a_unit_is_written_and_nothing_is_overwritten(
     site: Site, programs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     program(programs, "systemctl", f"echo $* >>{programs}/calls; echo Version=252\n")
-    assert setup.install(site, text_for(site), force=False) == 0
+    assert setup.install(site, text_for(site), ENDPOINT, force=False) == 0
     path, keys = site.settings / "gateway.yaml", site.settings / "gateway-keys.yaml"
+    assert (site.settings / "gateway.env").read_text() == f"VRAM_ARBITER_ENDPOINT={ENDPOINT}\n"
     assert [stat.S_IMODE(one.stat().st_mode) for one in (path, keys)] == [0o600, 0o600]
     (key,) = load_keys(keys.read_text(), "keys").keys
     said = capsys.readouterr().out.splitlines()
@@ -261,10 +268,15 @@ def test_files_are_private_a_unit_is_written_and_nothing_is_overwritten(
         f"--user enable {setup.UNIT}",
         f"--user restart {setup.UNIT}",
     ]
+    away = Found([GPU], [replace(OLLAMA, held_bytes=0)], frozenset({8000}))
+    kept = setup.with_kept(away, path)
+    assert (kept.servers, kept.listen) == ([OLLAMA], "127.0.0.1:8000"), "it is the gateway there"
+    assert config_text(kept, keys) == text_for(site)
+    assert setup.with_kept(away, keys.with_name("none")) == away
     with pytest.raises(ConfigError, match=r"gateway\.yaml exists") as refused:
-        setup.install(site, text_for(site), force=False)
+        setup.install(site, text_for(site), ENDPOINT, force=False)
     assert "--force" in str(refused.value.hint)
-    assert setup.install(site, text_for(site), force=True) == 0
+    assert setup.install(site, text_for(site), ENDPOINT, force=True) == 0
     (same,) = load_keys(keys.read_text(), "keys").keys
     assert same == key, "clients show it already"
 
@@ -272,15 +284,31 @@ def test_files_are_private_a_unit_is_written_and_nothing_is_overwritten(
 def test_without_systemd_it_says_how_to_serve(
     site: Site, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert setup.install(site, text_for(site), force=False) == 0
+    assert setup.install(site, text_for(site), ENDPOINT, force=False) == 0
     assert "systemd does not run here; start it by: vram-gateway serve" in capsys.readouterr().out
 
 
 def test_without_a_server_nothing_is_written(site: Site) -> None:
     text = config_text(Found([GPU], [], frozenset()), KEYS_FILE)
     with pytest.raises(ConfigError, match="no model server was found"):
-        setup.install(site, text, force=False)
+        setup.install(site, text, ENDPOINT, force=False)
     assert not site.settings.exists()
+
+
+@pytest.mark.e2e
+def test_a_dry_run_prints_the_file_and_changes_nothing(
+    arbiter_daemon: ArbiterProcess, programs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The GPU is that of the running arbiter; nobody needs a server for that."""
+    shown = f"Id=a.service\nExecStart={EXEC.format('/o', '/o/ollama serve')}\nControlGroup=\n"
+    answers = f"case $* in *list-unit-files*) echo a.service ;; *) echo '{shown}' ;; esac"
+    program(programs, "systemctl", f"echo $* >>{programs}/calls\n{answers}\n")
+    assert main(["setup", "--dry-run", "--endpoint", arbiter_daemon.endpoint]) == 0
+    said = capsys.readouterr().out
+    assert "# GPU: Simulated GPU (8 GiB)" in said
+    assert "# a: ollama, port 11434: nothing of it is on a GPU" in said
+    assert "servers: {}" in said
+    assert not [line for line in (programs / "calls").read_text().splitlines() if "enable" in line]
 
 
 def test_without_an_arbiter_it_says_how_to_start_it(tmp_path: Path) -> None:
