@@ -237,10 +237,9 @@ def took_turns(suite: Suite, name: str, answers: list[Answer]) -> None:
     problems = "; ".join(f"{count} x {problem}" for problem, count in seen.problems.items())
     answered = ", ".join(f"{model} {count}" for model, count in seen.answered.items())
     suite.figure(f"turns, {name}: requests", seen.requests, "requests", note=answered)
-    share = seen.failed / seen.requests * 100
-    suite.figure(f"turns, {name}: failed", share, "%", note=problems or None)
+    suite.figure(f"turns, {name}: failed", seen.failed, "requests", note=problems or None)
     if name == "gateway":
-        suite.rows[-1].target, suite.rows[-1].ok = "0 %", not seen.failed
+        suite.rows[-1].target, suite.rows[-1].ok = "0", not seen.failed
     span_s = max(one.ended_at for one in answers) - min(one.asked_at for one in answers)
     at_most = span_s / MIN_RESIDENCY_S if name == "gateway" else None
     suite.figure(f"turns, {name}: switches", seen.switches, "switches", at_most=at_most)

@@ -181,7 +181,10 @@ class Suite:
                 )
             ratio = "" if row.ratio is None else f"{row.ratio:.2f}"
             ok = {True: "ok", False: "MISS", None: ""}[row.ok]
-            lines.append(f"{row.name:58}{cells:>30}{ratio:>8}  {ok:5}{row.target or ''}".rstrip())
+            target = (
+                f"{row.target or '':28}{row.note or ''}" if row.value is not None else row.target
+            )
+            lines.append(f"{row.name:58}{cells:>30}{ratio:>8}  {ok:5}{target or ''}".rstrip())
         return "\n".join(lines)
 
     def write(self, path: Path) -> None:
