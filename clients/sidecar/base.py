@@ -12,7 +12,7 @@ one of the other kind. It gets one request at a time, in the shapes of `clients.
 import asyncio
 from collections.abc import Sequence
 from time import monotonic
-from typing import Any, ClassVar, Self, cast
+from typing import Any, ClassVar, Protocol, Self, cast
 
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.net.rpc_client import RpcClient
@@ -22,6 +22,7 @@ from vram_arbiter.schemas.errors import (
     FrameStale,
     ModelError,
     SidecarUnavailable,
+    VramError,
     from_wire,
 )
 from vram_arbiter.schemas.plain import JsonMap
@@ -30,6 +31,19 @@ from vram_arbiter.schemas.sidecar import LoadResult, PingResult
 CALL_TIMEOUT_S = 180.0  # a cold load of a large model; the field's clients wait as long
 CONNECT_TIMEOUT_S = 10.0  # for a sidecar that another program starts
 PROBE_S = 1.0  # one ping
+
+
+class Exchanges(Protocol):
+    """Requests and replies over one connection at a time (`clients.net.rpc_client.RpcClient`)."""
+
+    proven: bool
+
+    @property
+    def in_order(self) -> bool | None: ...
+
+    async def exchange(self, request: JsonMap, timeout_s: float) -> Any: ...
+
+    def drop(self, error: VramError) -> None: ...
 
 
 class SidecarClient:
@@ -53,7 +67,9 @@ class SidecarClient:
         """The last answer to `ping`."""
         self._timeout_s = timeout_s
         self._connect_timeout_s = connect_timeout_s
-        self._rpc = RpcClient(endpoint, program="sidecar", lost=self._lost, enveloped=True)
+        self._rpc: Exchanges = RpcClient(
+            endpoint, program="sidecar", lost=self._lost, enveloped=True
+        )
         self._connecting = asyncio.Lock()
         self._turn = asyncio.Lock()  # of requests whose replies are matched by their order
 
@@ -160,8 +176,8 @@ class SidecarClient:
                 await self.ping(timeout_s=self._connect_timeout_s)
             except SidecarUnavailable as error:
                 raise SidecarUnavailable(
-                    f"no sidecar answers at {self.endpoint} within {self._connect_timeout_s:g} s",
-                    hint="start it with `vram-sidecar`",
+                    f"no sidecar answers at {self.endpoint}: {error.message}",
+                    hint="start it with `vram-sidecar`, or the other project's server",
                     details={"endpoint": self.endpoint},
                 ) from error
 

@@ -105,6 +105,16 @@ def _openpi(value: dict[Any, Any]) -> Any:
     return _msgpack_numpy({"nd": True, "type": found.pop("dtype"), **found})
 
 
+def as_openpi(numbers: Any) -> dict[bytes, Any]:
+    """An array in openpi's form (its `msgpack_numpy.py`)."""
+    return {
+        _OPENPI: True,
+        b"data": numbers.tobytes(),
+        b"dtype": numbers.dtype.str,
+        b"shape": numbers.shape,
+    }
+
+
 def flat(data: bytes, dtype: Any, shape: Sequence[Any], offset: int = 0) -> Any:
     """The numbers behind `offset`, in a row; nothing is copied. Raises BadRequest where type, shape
     and bytes disagree."""

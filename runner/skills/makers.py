@@ -6,6 +6,8 @@ import os
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from vram_arbiter.clients.sidecar.base import CALL_TIMEOUT_S
+from vram_arbiter.clients.sidecar.openpi import OpenpiClient, Template
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.runner.goals.catalogue import Maker, sidecar_endpoint
 from vram_arbiter.runner.protocols import RobotDescription, Skill
@@ -13,9 +15,17 @@ from vram_arbiter.runner.safety.limits import Limits
 from vram_arbiter.runner.skills.ros_standins import TRAJECTORY, StandIn, StandIns
 from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
 from vram_arbiter.runner.skills.trajectory import FollowJointTrajectory
-from vram_arbiter.runner.skills.wiring import wire_up
+from vram_arbiter.runner.skills.wiring import Rollout, wire_up
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
+
+
+def client_of(rollout: Rollout, endpoint: str, timeout_s: float = CALL_TIMEOUT_S) -> PolicyClient:
+    """Return the client of a policy's server. Raises ConfigError for an address that is not one."""
+    if rollout.adapter == "openpi":
+        template = Template(rollout.openpi_observation)
+        return OpenpiClient(endpoint, template, timeout_s=timeout_s)
+    return PolicyClient(endpoint, timeout_s=timeout_s)
 
 
 def makers_of(
@@ -33,10 +43,11 @@ def makers_of(
     """Return the makers; `others` stand in for further interfaces, the rest as `SidecarPolicy`."""
 
     def make_policy(manifest: RSkillManifest) -> Skill:
+        wiring = wire_up(manifest, robot, robot.rest_pose_rad)
         return SidecarPolicy(
             manifest,
-            wire_up(manifest, robot, robot.rest_pose_rad),
-            PolicyClient(sidecar_endpoint(manifest.name, given, os.environ)),
+            wiring,
+            client_of(wiring.rollout, sidecar_endpoint(manifest.name, given, os.environ)),
             arbiter,
             period_s=period_s,
             wait_s=wait_s,

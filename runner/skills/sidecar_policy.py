@@ -35,7 +35,7 @@ from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.runner.skills.chunks import ChunkPlayer, Played, Row
 from vram_arbiter.runner.skills.model_phase import PHASE_S, model_phase
 from vram_arbiter.runner.skills.motion import JointRamp, action_of, is_at, joint_positions
-from vram_arbiter.runner.skills.wiring import View, Wiring
+from vram_arbiter.runner.skills.wiring import STATE, TASK, View, Wiring
 from vram_arbiter.schemas.errors import (
     BadState,
     Evicted,
@@ -76,7 +76,6 @@ STILL_WINDOW = (
 )
 STILL_RAD = 0.01
 STILL_FROM = 0.5  # share of the rollout before which standing still is just waiting
-STATE_KEY, TASK_KEY = "observation.state", "task"
 ACTION_KEY, CONFIDENCE_KEY = "action", "confidence"
 
 # The lease went between `load` and the use: load again. Anything else is the goal's failure.
@@ -168,7 +167,7 @@ class SidecarPolicy(SkillBase):
                 f"{self.key} needs a prompt", hint="say what to do, e.g. `grab the red cube`"
             )
         await self._occupy(goal)
-        begun = await self._client.reset({TASK_KEY: self._task}, token=self._token)
+        begun = await self._client.reset({TASK: self._task}, token=self._token)
         rollout = self._wiring.rollout
         self._ramp, self._running, self._commanded = None, goal.from_here, {}
         self._confidence = None
@@ -420,8 +419,8 @@ class SidecarPolicy(SkillBase):
 
         values = self._wiring.state.vector(world, measured, self._wiring.model)
         observation: Message = {
-            STATE_KEY: np.asarray(values, dtype=np.float32),
-            TASK_KEY: self._task,
+            STATE: np.asarray(values, dtype=np.float32),
+            TASK: self._task,
         }
         frames = world.image_frames or {}
         for camera, key in self._wiring.cameras.items():
@@ -447,7 +446,7 @@ class SidecarPolicy(SkillBase):
         if len(steps) == 1:
             return steps[0]
         return {
-            name: value if name == TASK_KEY else np.stack([step[name] for step in steps])
+            name: value if name == TASK else np.stack([step[name] for step in steps])
             for name, value in steps[-1].items()
         }
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
+from vram_arbiter.clients.sidecar.openpi import Template
 from vram_arbiter.runner.protocols import RobotDescription
 from vram_arbiter.runner.skills.action_contract import needs_frames as actions_need_frames
 from vram_arbiter.runner.skills.action_contract import plan_actions
@@ -26,6 +28,7 @@ from vram_arbiter.schemas.manifest import ManifestError, RSkillManifest
 from vram_arbiter.schemas.manifest.manifest import IMAGES_PREFIX
 from vram_arbiter.schemas.sidecar import LEFT_OVER_MAX
 
+STATE, TASK = "observation.state", "task"
 ROLLOUT_S = 5.0  # of motion, unless the manifest says otherwise
 
 
@@ -58,6 +61,9 @@ class Rollout(BaseModel):
     n_obs_steps: int | None = Field(
         default=None, ge=1, le=16
     )  # consecutive observations that a chunk needs; None: as many as the sidecar says, else 1
+    adapter: Literal["openpi"] | None = None  # a server of that project; None: a sidecar
+    openpi_observation: dict[str, JsonValue] = Field(default_factory=dict)
+    """What openpi's server is shown (`clients.sidecar.openpi.Template`)."""
     targets_lead: bool = (
         False  # its targets are set points far ahead of the arm: a robot goes there step by step
     )
@@ -123,6 +129,7 @@ def wire_up(
                 "continue",
             )
         )
+    problems += _openpi_problems(rollout, {*cameras.values(), STATE, TASK})
     if manifest.chunk_size and rollout.prefetch_at >= manifest.chunk_size:
         problems.append(
             Problem(
@@ -145,6 +152,22 @@ def wire_up(
         rollout,
         rollout_s,
     )
+
+
+def _openpi_problems(rollout: Rollout, there: set[str]) -> list[Problem]:
+    """Return what an openpi server is to be shown and is not `there`."""
+    path = ("policy_extras", "openpi_observation")
+    if rollout.adapter is None:
+        return []
+    try:
+        names = Template(rollout.openpi_observation).names
+    except ValueError as error:
+        return [Problem(path, str(error))]
+    if not names:
+        return [Problem(path, "is required with adapter: openpi")]
+    if unknown := sorted(names - there):
+        return [Problem(path, f"shows {', '.join(unknown)}; there is {', '.join(sorted(there))}")]
+    return []
 
 
 def _cameras(manifest: RSkillManifest) -> dict[str, str]:

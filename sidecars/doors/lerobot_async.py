@@ -80,7 +80,7 @@ _log = logging.getLogger("sidecars")
 async def served(path: Path, offers: Offers, conduct: Conduct) -> AsyncIterator[None]:
     """Serve at the unix socket `path` within the block, and judge what comes for its `conduct`."""
     server = grpc.aio.server(options=_OPTIONS, maximum_concurrent_rpcs=REQUESTS_MAX)
-    server.add_generic_rpc_handlers((_handlers(_Door(offers, conduct), conduct),))
+    server.add_generic_rpc_handlers((_handlers(_Door(offers, conduct)),))
     server.add_insecure_port(f"unix:{path}")
     await server.start()
     try:
@@ -92,7 +92,7 @@ async def served(path: Path, offers: Offers, conduct: Conduct) -> AsyncIterator[
 class _Door:
     def __init__(self, offers: Offers, conduct: Conduct) -> None:
         self._offers = offers
-        self._conduct = conduct
+        self.conduct = conduct
         self._robots: dict[str, Robot] = {}  # by the name of their end
         self._messages = _messages()
 
@@ -127,11 +127,9 @@ class _Door:
             async with asyncio.timeout(STREAM_S), robot.receiving:
                 data = await _joined(chunks)
                 robot.offer(observation_of(data, robot.asked))
-                self._conduct.served(_end(context.peer()), len(data))
+                self.conduct.served(_end(context.peer()), len(data))
         except TimeoutError:
-            raise LimitExceeded(
-                f"an observation that takes longer than {STREAM_S:g} s", hint="send less"
-            ) from None
+            raise LimitExceeded(f"it takes longer than {STREAM_S:g} s", hint="send less") from None
         return self._messages.Empty()
 
     async def get_actions(self, request: Any, context: Any) -> Any:
@@ -166,14 +164,12 @@ def _end(peer: str) -> str:
 async def _joined(chunks: AsyncIterable[Any]) -> bytes:
     """Return the bytes of one observation. Raises BadRequest, LimitExceeded."""
     parts: list[bytes] = []
-    left_bytes = IMAGES_MAX_BYTES
     try:
         async for chunk in chunks:
             if chunk.transfer_state == _BEGIN:
                 parts.clear()
             parts.append(chunk.data)
-            left_bytes -= len(parts[-1])
-            if left_bytes < 0 or len(parts) > CHUNKS_MAX:
+            if len(parts) > CHUNKS_MAX or sum(map(len, parts)) > IMAGES_MAX_BYTES:
                 raise LimitExceeded(
                     f"an observation of more than {IMAGES_MAX_BYTES} bytes or {CHUNKS_MAX} chunks",
                     hint="send smaller pictures",
@@ -185,7 +181,7 @@ async def _joined(chunks: AsyncIterable[Any]) -> bytes:
     raise BadRequest("an observation without its end", hint="send what robot_client sends")
 
 
-def _handlers(door: _Door, conduct: Conduct) -> Any:
+def _handlers(door: _Door) -> Any:
     unary, stream = grpc.unary_unary_rpc_method_handler, grpc.stream_unary_rpc_method_handler
     known = _messages()
     methods = {
@@ -197,15 +193,13 @@ def _handlers(door: _Door, conduct: Conduct) -> Any:
     return grpc.method_handlers_generic_handler(
         SERVICE,
         {
-            name: make(_told(answer, reply, conduct), request.FromString, reply.SerializeToString)
+            name: make(_told(door, answer, reply), request.FromString, reply.SerializeToString)
             for name, (make, answer, request, reply) in methods.items()
         },
     )
 
 
-def _told(
-    answer: Callable[..., Any], reply: Callable[[], Any], conduct: Conduct
-) -> Callable[..., Any]:
+def _told(door: _Door, answer: Callable[..., Any], reply: Callable[[], Any]) -> Callable[..., Any]:
     """Return a handler whose typed errors are statuses, with an empty `reply`."""
 
     async def answered(request: Any, context: Any) -> Any:
@@ -215,7 +209,7 @@ def _told(
             status = _STATUSES.get(type(error), grpc.StatusCode.ABORTED)
             details = f"{error.code}: {error}"[:DETAILS_MAX_CHARS]
             if isinstance(error, CallerError):
-                conduct.refused(_end(context.peer()))
+                door.conduct.refused(_end(context.peer()))
         context.set_code(status)  # `abort` would keep the request until the collector runs
         context.set_details(details)
         return reply()

@@ -12,12 +12,12 @@ import hmac
 import logging
 import time
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import aiohttp
 import msgpack
-from aiohttp import web
+from aiohttp import WSMessage, WSMsgType, web
 
 from vram_arbiter.clients.net.server import IMAGES_MAX_BYTES
 from vram_arbiter.clients.sidecar import npy
@@ -41,16 +41,8 @@ _log = logging.getLogger("sidecars")
 
 
 @contextlib.asynccontextmanager
-async def served(
-    path: Path,
-    sidecar: PolicyClient,
-    manifest: RSkillManifest,
-    keys: Sequence[bytes],
-    conduct: Conduct,
-) -> AsyncIterator[None]:
-    """Serve at the unix socket `path` within the block, and judge what comes for its `conduct`.
-    `keys`: empty lets in clients without."""
-    door = _Door(sidecar, manifest, keys, conduct)
+async def served(path: Path, door: "Door") -> AsyncIterator[None]:
+    """Serve at the unix socket `path` within the block."""
     app = web.Application()
     app.add_routes([web.get("/healthz", _health), web.get("/{path:.*}", door.connect)])
     runner = web.AppRunner(app, handle_signals=False, access_log=None, shutdown_timeout=0.1)
@@ -66,28 +58,24 @@ async def _health(request: web.Request) -> web.Response:
     return web.Response(text="OK\n")
 
 
-class _Door:
-    def __init__(
-        self,
-        sidecar: PolicyClient,
-        manifest: RSkillManifest,
-        keys: Sequence[bytes],
-        conduct: Conduct,
-    ) -> None:
-        self._sidecar = sidecar
-        self._manifest = manifest
-        self._keys = keys
-        self._conduct = conduct
+@dataclass(frozen=True, slots=True)
+class Door:
+    """What is served. `keys`: empty lets in clients without; `conduct` is told of each request."""
+
+    sidecar: PolicyClient
+    manifest: RSkillManifest
+    keys: Sequence[bytes]
+    conduct: Conduct
 
     async def connect(self, request: web.Request) -> web.StreamResponse:
         """Serve one client until it hangs up."""
-        if self._keys and not self._knows(request.headers.get("Authorization", "")):
+        if self.keys and not self._knows(request.headers.get("Authorization", "")):
             return web.Response(status=401, text="the API key is missing or wrong\n")
         return await self._talk(request)
 
     def _knows(self, authorization: str) -> bool:
         given = authorization.removeprefix("Api-Key ").encode("utf-8", "surrogateescape")
-        return any(hmac.compare_digest(given, key) for key in self._keys)
+        return any(hmac.compare_digest(given, key) for key in self.keys)
 
     async def _talk(self, request: web.Request) -> web.WebSocketResponse:
         """Read all the time, which answers pings: a client that has no answer to them hangs up."""
@@ -109,22 +97,20 @@ class _Door:
     async def _greet(self, socket: web.WebSocketResponse) -> None:
         """Load the model, then send the metadata: openpi's server listens once it has loaded."""
         try:
-            await self._sidecar.load()
-            await socket.send_bytes(msgpack.packb(metadata(self._manifest)))
+            await self.sidecar.load()
+            await socket.send_bytes(msgpack.packb(metadata(self.manifest)))
         except VramError as error:
             reason = f"{error.code}: {error.message}".encode()[:_REASON_MAX_BYTES]
             await socket.close(code=1013, message=reason.decode(errors="ignore").encode())
 
-    async def _answer(
-        self, socket: web.WebSocketResponse, message: aiohttp.WSMessage, end: str
-    ) -> None:
+    async def _answer(self, socket: web.WebSocketResponse, message: WSMessage, end: str) -> None:
         try:
             answer = await self._infer(message)
-            self._conduct.served(end, len(message.data))
+            self.conduct.served(end, len(message.data))
             await socket.send_bytes(answer)
         except VramError as error:
             if isinstance(error, CallerError):
-                self._conduct.refused(end)
+                self.conduct.refused(end)
             await socket.send_str(f"{error.code}: {error}")
         except ConnectionError:
             pass  # it has hung up
@@ -132,19 +118,19 @@ class _Door:
             _log.exception("internal error at the door")
             await socket.send_str(f"{InternalError.code}: {type(error).__name__}: see the log")
 
-    async def _infer(self, message: aiohttp.WSMessage) -> bytes:
+    async def _infer(self, message: WSMessage) -> bytes:
         """Return the answer to an observation. Raises FrameStale where no model began to look at it
         within `FRESH_S`, BadFrame, BadRequest, and what the sidecar raises."""
-        if message.type is not aiohttp.WSMsgType.BINARY:
+        if message.type is not WSMsgType.BINARY:
             raise BadFrame("expected a msgpack map, got a text", hint="send one msgpack map")
         began_s = time.monotonic()
-        observation = observed(npy.unpack(unpack_map(message.data, _LIMITS)), self._manifest)
-        answer = await self._sidecar.get_action(
+        observation = observed(npy.unpack(unpack_map(message.data, _LIMITS)), self.manifest)
+        answer = await self.sidecar.get_action(
             observation, whole_chunk=True, afresh=True, fresh_s=FRESH_S
         )
         took_ms = (time.monotonic() - began_s) * 1000
         packed: bytes = msgpack.packb(
-            {"actions": _array(answer["action"]), "server_timing": {"infer_ms": took_ms}}
+            {"actions": npy.as_openpi(answer["action"]), "server_timing": {"infer_ms": took_ms}}
         )
         return packed
 
@@ -205,13 +191,3 @@ def _state(vectors: Mapping[str, Any], order: Any) -> Any:
 def _picture(pixels: Any) -> Any:
     """Return a picture with its channels last; openpi's policies take them in front too."""
     return pixels.transpose(1, 2, 0) if pixels.shape[0] == 3 != pixels.shape[2] else pixels
-
-
-def _array(numbers: Any) -> dict[bytes, Any]:
-    """Return an array in openpi's form (`msgpack_numpy.py`)."""
-    return {
-        b"__ndarray__": True,
-        b"data": numbers.tobytes(),
-        b"dtype": numbers.dtype.str,
-        b"shape": numbers.shape,
-    }

@@ -8,8 +8,8 @@ from typing import Any
 from tests.runner.small_robots import robot_of
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.sidecar import npy
-from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.runner.protocols import Act, Done, StepOutcome
+from vram_arbiter.runner.skills.makers import client_of
 from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
 from vram_arbiter.runner.skills.wiring import Wiring, wire_up
 from vram_arbiter.schemas.errors import VramError
@@ -180,9 +180,9 @@ class Bench:
         self, manifest: RSkillManifest, endpoint: str, arbiter: Arbiter | None, **options: Any
     ) -> None:
         self.sidecar, self.arbiter = Sidecar(), arbiter
-        self.client = PolicyClient(endpoint, timeout_s=60.0)
         options.setdefault("wait_s", 60.0)
         wiring: Wiring = wire_up(manifest, robot_of(*JOINTS), REST)
+        self.client = client_of(wiring.rollout, endpoint, timeout_s=60.0)
         self.skill = SidecarPolicy(
             manifest, wiring, self.client, arbiter, period_s=1 / 30, **options
         )

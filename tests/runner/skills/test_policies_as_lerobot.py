@@ -13,8 +13,8 @@ import pytest
 
 from tests.runner.small_robots import robot_of
 from tests.sidecars.adapters import policies
+from tests.sidecars.adapters.families import SEED, lerobots_own, manifest_text
 from tests.sidecars.adapters.policies import DIM, FRONT, SIDE_PX, STATE, TASK, WRIST
-from tests.sidecars.adapters.test_policy_families import SEED, lerobots_own, manifest_text
 from vram_arbiter.runner.protocols import Act, Done, Goal
 from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
 from vram_arbiter.runner.skills.wiring import wire_up

@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from tests.sidecars.adapters import policies, tiny_vision
+from tests.sidecars.adapters import families, policies, tiny_vision
 from vram_arbiter.schemas.manifest import RSkillManifest, parse_manifest
+from vram_arbiter.sidecars.adapters.policy_families import FAMILIES
 from vram_arbiter.sidecars.weights import Weights, resolve
 
 SAVERS: dict[str, Callable[[Path], None]] = {
@@ -53,6 +54,23 @@ def saved(
         return Weights(str(folder), local=True)
 
     return saved
+
+
+@pytest.fixture(scope="session")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Weights]:
+    """Return a checkpoint of a family, or skip the test where a package is missing."""
+    folder = tmp_path_factory.mktemp("policies")
+
+    def checkpoint(name: str) -> Weights:
+        for package in FAMILIES[families.family_of(name)].packages:
+            pytest.importorskip(package)
+        place = folder / f"clip {name}"  # multi_task_dit wants `clip` in its encoders' names
+        if not place.exists():
+            place.mkdir()
+            families.SAVERS[name](place)
+        return Weights(str(place), local=True)
+
+    return checkpoint
 
 
 @pytest.fixture(scope="module")

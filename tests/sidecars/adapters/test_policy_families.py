@@ -1,12 +1,11 @@
 """Every policy family that is served, loaded as in production, against lerobot itself.
 
-A tiny checkpoint of each family is saved by lerobot (`policies.py`). The reference is the robot's
+A tiny checkpoint of each family is saved by lerobot (`policies.py`); tools of these tests are in
+`families.py`. The reference is the robot's
 own loop in lerobot: preprocess, `select_action`, postprocess, at every control step.
 """
 
-import asyncio
 import json
-import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,210 +13,53 @@ from typing import Any
 
 import pytest
 
-from tests.sidecars.adapters import backbone_policies, policies
-from tests.sidecars.adapters.policies import DIM, FRONT, ONLY_CAMERA, SIDE_PX, STATE, TASK, WRIST
-from tests.support.waiting import play
-from vram_arbiter.clients.net.server import RouterServer
-from vram_arbiter.clients.sidecar import npy
-from vram_arbiter.clients.sidecar.policy import PolicyClient
+from tests.sidecars.adapters import policies
+from tests.sidecars.adapters.families import (
+    BY_DAY,
+    NAMES,
+    SEED,
+    ask,
+    begin,
+    copied,
+    family_of,
+    history,
+    is_refused,
+    lerobots_own,
+    load_policy,
+    manifest_of,
+    manifest_text,
+    observations,
+    prepared,
+    served,
+    stacked,
+)
+from tests.sidecars.adapters.policies import DIM, FRONT, ONLY_CAMERA, STATE
 from vram_arbiter.schemas.errors import (
     BadRequest,
     ConfigError,
     ModelError,
     UnsupportedQuantization,
-    VramError,
 )
-from vram_arbiter.schemas.manifest import ModelFamily, RSkillManifest, parse_manifest
-from vram_arbiter.schemas.manifest.vocabulary import PROCESSOR_FAMILIES
-from vram_arbiter.schemas.plain import Message
+from vram_arbiter.schemas.manifest import ModelFamily, parse_manifest
 from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.policy import PolicyAdapter
 from vram_arbiter.sidecars.adapters.policy_families import FAMILIES
-from vram_arbiter.sidecars.doors.lerobot_messages import instructions_of, observation_of
-from vram_arbiter.sidecars.doors.robot import Robot
 from vram_arbiter.sidecars.host_weights import HostWeights
 from vram_arbiter.sidecars.settings import read_model
-from vram_arbiter.sidecars.weights import Weights, read_config
-from vram_arbiter.sidecars.wires import parse
+from vram_arbiter.sidecars.weights import Weights
 
 pytestmark = [pytest.mark.heavy, pytest.mark.usefixtures("small_networks")]
 
-SAVERS = policies.SAVERS | backbone_policies.SAVERS
-NAMES = tuple(SAVERS)
 ROWS = {  # actions in one answer, else 3: the checkpoint's n_action_steps
     "act ensembling": 1, "diffusion": 4, "vqbet": 4, "tdmpc": 2, "gaussian_actor": 1,
     "multi_task_dit": 4, "lingbot_va": 4,
 }  # fmt: skip
 WHOLE = ("act", "smolvla", "pi0", "pi05", "xvla", "eo1", "evo1", "vla_jepa", "wall_x")
 CHUNK_ROWS = 5  # of these, where the whole chunk is asked for
-SEED = 2  # most policies draw their actions
 NOT_SERVED = {
     "openvla": "", "fastwam": "hub repository whose name is fixed in its code",
 }  # fmt: skip
-
-
-def family_of(name: str) -> ModelFamily:
-    return ModelFamily(name.split()[0])
-
-
-def manifest_text(family: str, dtype: str = "fp32", more: str = "", extra: str = "") -> str:
-    files = "{preprocessor_uri: local://x/a.json, postprocessor_uri: local://x/b.json}"
-    processors = f"processors: {files}\n" if family in PROCESSOR_FAMILIES else ""
-    return (
-        "name: test/model\nversion: 0.1.0\nkind: vla\nembodiment_tags: [any]\nchunk_size: 1\n"
-        "weights_uri: local://models/x\ndescription: a tiny model\nactions: [grasp]\n"
-        f"latency_budget: {{per_chunk_ms: 100}}\nmodel_family: {family}\n"
-        f"quantization: {{dtype: {dtype}, extra: {{trust_remote_code: true{extra}}}}}\n"
-        "actuators_required:\n"
-        "  - {kind: joint_position, control_mode_semantics: {mode: absolute}}\n"
-        + (more or processors)
-    )
-
-
-def manifest_of(name: str, dtype: str | None = None, **fields: Any) -> RSkillManifest:
-    supported = FAMILIES[family_of(name)].precisions if family_of(name) in FAMILIES else {"fp32"}
-    found = parse_manifest(
-        manifest_text(family_of(name), dtype or ("fp32" if "fp32" in supported else "bf16"))
-    )
-    return found.model_copy(update=fields)
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Weights]:
-    """Return a checkpoint of a family, or skip the test where a package is missing."""
-    folder = tmp_path_factory.mktemp("policies")
-
-    def checkpoint(name: str) -> Weights:
-        for package in FAMILIES[family_of(name)].packages:
-            pytest.importorskip(package)
-        place = folder / f"clip {name}"  # multi_task_dit wants `clip` in its encoders' names
-        if not place.exists():
-            place.mkdir()
-            SAVERS[name](place)
-        return Weights(str(place), local=True)
-
-    return checkpoint
-
-
-def load_policy(
-    name: str, weights: Weights, dtype: str | None = None, **fields: Any
-) -> PolicyAdapter:
-    adapter = prepared(manifest_of(name, dtype, **fields), weights)
-    adapter.load("cpu")
-    adapter.place("cpu")
-    return adapter
-
-
-def prepared(manifest: RSkillManifest, weights: Weights) -> PolicyAdapter:
-    adapter = make_adapter(manifest, weights)
-    assert isinstance(adapter, PolicyAdapter)
-    adapter.prepare()
-    return adapter
-
-
-def copied(weights: Weights, folder: Path) -> Weights:
-    """Return a copy of a checkpoint, to be damaged."""
-    shutil.copytree(weights.source, folder)
-    return Weights(str(folder), local=True)
-
-
-def is_refused(adapter: PolicyAdapter, told: str, error: type[VramError] = ModelError) -> None:
-    """Check that neither a load nor `--check` takes a checkpoint."""
-    for device in ("cpu", "meta"):
-        with pytest.raises(error, match=told):
-            adapter.load(device)
-
-
-def observations(count: int) -> list[dict[str, Any]]:
-    import numpy as np
-
-    random = np.random.default_rng(1)
-
-    def picture() -> Any:
-        return random.integers(0, 255, (SIDE_PX, SIDE_PX, 3), np.uint8)
-
-    return [
-        {
-            STATE: random.normal(size=DIM).astype(np.float32),
-            **{name: picture() for name in (FRONT, WRIST, ONLY_CAMERA)},
-            "task": TASK,
-        }
-        for _ in range(count)
-    ]
-
-
-def ask(adapter: PolicyAdapter, observation: dict[str, Any], whole_chunk: bool = False) -> Any:
-    call = EndpointCall(
-        endpoint="get_action", data={"observation": observation}, whole_chunk=whole_chunk
-    )
-    return adapter.run(call)["action"]
-
-
-def begin(adapter: PolicyAdapter) -> tuple[int, int]:
-    """Begin an episode; return its control steps of an observation, and actions of an answer."""
-    answer = adapter.run(EndpointCall(endpoint="reset"))
-    return answer["n_obs_steps"], answer["n_action_steps"]
-
-
-def history(steps: list[dict[str, Any]], at: int, length: int) -> dict[str, Any]:
-    """Return the observation of control step `at` as the runner sends it."""
-    return stacked([steps[max(0, place)] for place in range(at + 1 - length, at + 1)])
-
-
-def served(adapter: PolicyAdapter, steps: list[dict[str, Any]]) -> Any:
-    """Return the actions of one episode, played as they are answered."""
-    import numpy as np
-    import torch
-
-    length, _ = begin(adapter)
-    torch.manual_seed(SEED)
-    actions: list[Any] = []
-    while len(actions) < len(steps):
-        answer = ask(adapter, history(steps, len(actions), length))
-        assert answer.dtype == np.float32
-        actions += list(answer)
-    return np.stack(actions[: len(steps)])
-
-
-def stacked(steps: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return consecutive observations as one with a leading dimension."""
-    import numpy as np
-
-    together = {
-        name: np.stack([step[name] for step in steps]) for name in steps[0] if name != "task"
-    }
-    return together | {"task": TASK}
-
-
-def lerobots_own(weights: Weights, steps: list[dict[str, Any]], **settings: Any) -> Any:
-    """Return the actions of lerobot's loop, one a control step."""
-    import numpy as np
-    import torch
-    from lerobot.configs.policies import PreTrainedConfig
-    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-    from lerobot.utils.constants import OBS_IMAGES
-
-    config = read_config(PreTrainedConfig, weights)
-    config.device = "cpu"
-    if hasattr(config, "pretrained_backbone_weights"):
-        config.pretrained_backbone_weights = None  # no network here
-    for field, value in settings.items():
-        setattr(config, field, value)
-    policy = get_policy_class(config.type).from_pretrained(weights.source, config=config)
-    policy.eval()
-    before, after = make_pre_post_processors(config, pretrained_path=weights.source)
-    policy.reset()
-    torch.manual_seed(SEED)
-    rows = []
-    for step in steps:
-        batch: dict[str, Any] = {STATE: torch.from_numpy(step[STATE]), "task": TASK}
-        for name in config.input_features:
-            if name.startswith((OBS_IMAGES, ONLY_CAMERA)) and name in step:
-                batch[name] = torch.from_numpy(step[name]).permute(2, 0, 1).float() / 255
-        with torch.inference_mode():
-            rows.append(after(policy.select_action(before(batch)))[0].numpy())
-    return np.stack(rows)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "lingbot_va"])
@@ -625,9 +467,6 @@ def test_a_quantized_layer_takes_the_numbers_of_autocast(tmp_path: Path, dtype: 
     assert ask(adapter, observations(1)[0]).shape == (3, DIM)
 
 
-BY_DAY = ("pi05", "smolvla", "diffusion")  # whose checkpoints are damaged in a usual run
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -903,70 +742,3 @@ def test_a_pinned_revision_is_what_is_loaded(
     adapter = load_policy("pi05", Weights("field/pi05", "0f1e2d"))
     assert asked == [("field/pi05", "0f1e2d")]
     assert ask(adapter, observations(1)[0]).shape == (3, DIM)
-
-
-AT_DOORS = [
-    pytest.param(name, marks=() if name in BY_DAY else pytest.mark.nightly)
-    for name in NAMES
-    if name != "lingbot_va"
-]
-
-
-@pytest.mark.parametrize("name", AT_DOORS)
-def test_a_family_is_served_at_lerobots_door(
-    checkpoint: Callable[[str], Weights], name: str, short_folder: Path
-) -> None:
-    """As lerobot's robots write their observations, with the history that the policy sees. At
-    lerobot's own server, diffusion fails at the first observation."""
-    import numpy as np
-    import torch
-    from lerobot.async_inference.helpers import RemotePolicyConfig, TimedObservation
-
-    adapter = load_policy(name, checkpoint(name))
-    length, _ = begin(adapter)
-    steps, joints = observations(4), [f"joint_{number}.pos" for number in range(DIM)]
-    prefix = "observation.images."
-    cameras = [one for one in adapter._config.input_features if one in steps[0] and one != STATE]
-    features: dict[str, Any] = {STATE: {"dtype": "float32", "shape": (DIM,), "names": joints}}
-    renamed = {prefix + one.rpartition(".")[2]: one for one in cameras}
-    features |= {one: {"dtype": "image", "shape": (SIDE_PX, SIDE_PX, 3)} for one in renamed}
-    config = RemotePolicyConfig("act", "test/model", features, 50, rename_map=renamed)
-    asked = instructions_of(pickle.dumps(config))
-
-    def answered(call: EndpointCall) -> Any:
-        torch.manual_seed(SEED)
-        return adapter.run(call)
-
-    async def story() -> None:
-        async def handle(peer: Any, message: Message) -> None:
-            reply: Message = {"ok": True}
-            if message["endpoint"] == "get_action":
-                call = parse(message, adapter.ops)
-                assert isinstance(call, EndpointCall)
-                reply = npy.pack(answered(call))
-            await server.send(peer, reply | {"re": message["id"]})
-
-        endpoint = f"ipc://{short_folder}/s"
-        async with (
-            RouterServer(endpoint, lambda error: {"error": str(error)}) as server,
-            PolicyClient(endpoint) as client,
-        ):
-            serving = asyncio.create_task(server.serve(handle))
-            robot = Robot(asked, client)
-            for number, step in enumerate(steps):
-                state = dict(zip(joints, map(float, step[STATE]), strict=True))
-                pictures = {asked.cameras[one]: step[one] for one in cameras}
-                raw = {**state, **pictures, "task": TASK}
-                timed = TimedObservation(
-                    timestamp=0.0, timestep=number, observation=raw, must_go=True
-                )
-                robot.offer(observation_of(pickle.dumps(timed), asked))
-                _, rows = await robot.act()
-                data = {"observation": history(steps, number, length)}
-                whole = EndpointCall(
-                    endpoint="get_action", data=data, afresh=True, whole_chunk=True
-                )
-                np.testing.assert_array_equal(rows, answered(whole)["action"][:50])
-            serving.cancel()
-
-    play(story)
