@@ -22,7 +22,7 @@ from typing import Any
 
 from vram_arbiter.clients.cli import arguments
 from vram_arbiter.clients.cli.demo_display import Display
-from vram_arbiter.clients.cli.demo_programs import Program, Programs
+from vram_arbiter.clients.cli.demo_programs import DemoProgram, Programs
 from vram_arbiter.clients.cli.demo_report import (
     MemoryStory,
     draw_timeline,
@@ -361,7 +361,7 @@ async def _until_up(programs: Programs, ping: Any) -> None:
 
 async def _watch(
     programs: Programs,
-    reasoner: Program,
+    reasoner: DemoProgram,
     client: AsyncClient | None,
     display: Display,
     watch: Watch,
@@ -411,12 +411,12 @@ async def _look(client: AsyncClient | None, display: Display, watch: Watch) -> N
         display.event(event, event["at_wall_s"] - watch.wall_offset_s - watch.start_s)
 
 
-def _check_others(programs: Programs, reasoner: Program) -> None:
+def _check_others(programs: Programs, reasoner: DemoProgram) -> None:
     if reasoner.process.returncode is None:
         programs.check()
 
 
-def _last_line(program: Program) -> str:
+def _last_line(program: DemoProgram) -> str:
     lines = program.log.read_text(errors="replace").splitlines()
     return lines[-1].partition("reasoner.loop ")[2] if lines else ""
 

@@ -18,7 +18,7 @@ LOG_TAIL_LINES = 15
 
 
 @dataclass(slots=True)
-class Program:
+class DemoProgram:
     """One child process and where its output goes."""
 
     name: str
@@ -42,9 +42,9 @@ class Programs:
 
     log_dir: Path
     environ: Mapping[str, str]
-    running: dict[str, Program] = field(default_factory=dict)
+    running: dict[str, DemoProgram] = field(default_factory=dict)
 
-    async def start(self, name: str, package: str, *arguments: str) -> Program:
+    async def start(self, name: str, package: str, *arguments: str) -> DemoProgram:
         """Start `python -m vram_arbiter.PACKAGE ARGUMENTS`; its output goes to
         `<log_dir>/<name>.log`."""
         log = self.log_dir / f"{name}.log"
@@ -54,7 +54,7 @@ class Programs:
                 stdin=asyncio.subprocess.DEVNULL, stdout=sink, stderr=sink,
                 env=dict(os.environ) | traces.environ() | dict(self.environ),
             )  # fmt: skip
-        program = self.running[name] = Program(name, process, log)
+        program = self.running[name] = DemoProgram(name, process, log)
         return program
 
     def pids(self) -> dict[int, str]:

@@ -127,11 +127,12 @@ class OpenpiLink:
         self._socket: aiohttp.ClientWebSocketResponse | None = None
 
     async def exchange(self, request: JsonMap, timeout_s: float) -> Any:
-        """Return the chunk as `action` for `get_action`; `ping` and `reset` need a connection alone,
-        because its policies remember nothing.
+        """Return the chunk as `action` for `get_action`; `ping` and `reset` need a connection
+        alone, because its policies remember nothing.
 
-        Raises: TimeoutError; UnknownOp for other requests; BadRequest for an observation that lacks something; ModelError for a
-        text and for an answer that is not read; UntrustedServer; the error of `lost`.
+        Raises: TimeoutError; UnknownOp for other requests; BadRequest for an observation that lacks
+        something; ModelError for a text and for an answer that is not read; UntrustedServer; the
+        error of `lost`.
         """
         if (op := request["endpoint"]) not in ("ping", "reset", "get_action"):
             raise UnknownOp(f"openpi's server has no {op}", hint="it ends as its own program does")

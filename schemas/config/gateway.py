@@ -118,8 +118,8 @@ class ClientLimits(_Section):
     header_max_bytes: Annotated[ByteSize, Field(ge=1024, le=1 << 20)] = 16 << 10
     """Longest request line, and longest header."""
     head_s: Seconds = 30.0
-    """Longest time for a request's head to arrive, and longest silence of a body and of a kept-alive
-    connection."""
+    """Longest time for a request's head to arrive, and longest silence of a body and of a
+    kept-alive connection."""
     connections_per_peer: Annotated[int, Field(ge=1, le=65_536)] = 2048
     """Connections of one address at a time."""
 

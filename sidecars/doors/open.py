@@ -102,7 +102,7 @@ async def opened(
         else:
             from vram_arbiter.sidecars.doors import openpi
 
-            served = openpi.Door(offers.clients[0], manifest, door.keys, conduct)
+            served = openpi.OpenpiDoor(offers.clients[0], manifest, door.keys, conduct)
             await stack.enter_async_context(openpi.served(path, served))
         path.chmod(0o660)
         await stack.enter_async_context(on_port(door.port, path, CONNECTIONS_MAX, conduct))

@@ -41,7 +41,7 @@ _log = logging.getLogger("sidecars")
 
 
 @contextlib.asynccontextmanager
-async def served(path: Path, door: "Door") -> AsyncIterator[None]:
+async def served(path: Path, door: "OpenpiDoor") -> AsyncIterator[None]:
     """Serve at the unix socket `path` within the block."""
     app = web.Application()
     app.add_routes([web.get("/healthz", _health), web.get("/{path:.*}", door.connect)])
@@ -59,7 +59,7 @@ async def _health(request: web.Request) -> web.Response:
 
 
 @dataclass(frozen=True, slots=True)
-class Door:
+class OpenpiDoor:
     """What is served. `keys`: empty lets in clients without; `conduct` is told of each request."""
 
     sidecar: PolicyClient

@@ -41,7 +41,8 @@ class Log:
 
 
 class Reader:
-    """New lines of logs for one client. `late`: it was BEHIND_MAX_BYTES behind, and gets no more."""
+    """New lines of logs for one client. `late`: it was BEHIND_MAX_BYTES behind, and gets no
+    more."""
 
     def __init__(self) -> None:
         self.late = False

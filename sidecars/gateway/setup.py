@@ -76,7 +76,7 @@ KINDS: Final[Mapping[str, Kind]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Server:
+class FoundServer:
     """A model server that was found. `where`: `unit`, `container`, or `pid` of one that was started
     by hand; `held_bytes` and `gpu`: what the arbiter reads of it."""
 
@@ -99,7 +99,7 @@ class Found:
     address of a configuration that is there."""
 
     gpus: Sequence[Mapping[str, Any]]
-    servers: Sequence[Server]
+    servers: Sequence[FoundServer]
     taken: frozenset[int]
     programs: Sequence[str] = ()
     listen: str = ""
@@ -132,7 +132,7 @@ def listening(proc: Path = procfs.PROC) -> frozenset[int]:
     return frozenset(int(line[1].rpartition(":")[2], 16) for line in lines if line[3] == _LISTENS)
 
 
-def units() -> list[Server]:
+def units() -> list[FoundServer]:
     """Return the services of systemd that start a model server: root's are the machine's, another
     user's its own."""
     control = ("systemctl", *(("--user",) if os.getuid() else ()))
@@ -145,11 +145,11 @@ def units() -> list[Server]:
         command = " ".join(re.findall(r"argv\[\]=(.*?) ; ", facts.get("ExecStart", "")))
         if kind := kind_of(command):
             place = port_of(kind, command), command, facts.get("ControlGroup", "")
-            found.append(Server(kind, "unit", facts["Id"], *place))
+            found.append(FoundServer(kind, "unit", facts["Id"], *place))
     return found
 
 
-def containers() -> list[Server]:
+def containers() -> list[FoundServer]:
     """Return the containers of podman and docker that hold a model server. Root's unit cannot run
     podman within its limits."""
     found = []
@@ -168,14 +168,16 @@ def containers() -> list[Server]:
                 port = outside[0] if outside else port_of(kind, command)
                 cgroup = procfs.read_cgroup(pid) if pid else ""
                 name = one["Name"].lstrip("/")
-                found.append(Server(kind, "container", name, port, command, cgroup))
+                found.append(FoundServer(kind, "container", name, port, command, cgroup))
     return found
 
 
-def by_hand(known: Iterable[int], taken: Iterable[int], proc: Path = procfs.PROC) -> list[Server]:
+def by_hand(
+    known: Iterable[int], taken: Iterable[int], proc: Path = procfs.PROC
+) -> list[FoundServer]:
     """Return servers that listen, and are no unit's and no container's; `kind` is "" before they
     answered. `known`: ports of those."""
-    found = {kind.port: Server("", "pid", "", kind.port) for kind in KINDS.values()}
+    found = {kind.port: FoundServer("", "pid", "", kind.port) for kind in KINDS.values()}
     for entry in proc.iterdir():
         try:
             command = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
@@ -183,11 +185,11 @@ def by_hand(known: Iterable[int], taken: Iterable[int], proc: Path = procfs.PROC
             continue
         if entry.name.isdecimal() and (kind := kind_of(command)):
             port = port_of(kind, command)
-            found[port] = Server("", "pid", kind, port, command.strip(), pid=int(entry.name))
+            found[port] = FoundServer("", "pid", kind, port, command.strip(), pid=int(entry.name))
     return [server for port, server in found.items() if port in taken and port not in known]
 
 
-def asked(server: Server) -> Server:
+def asked(server: FoundServer) -> FoundServer:
     """Return a server that listens, by what its own endpoints say. A port that answers as no kind
     is another program's."""
     kinds = [server.kind] if server.kind else list(KINDS)
@@ -207,7 +209,7 @@ def asked(server: Server) -> Server:
     return server
 
 
-def measured(server: Server, gpus: Sequence[Mapping[str, Any]]) -> Server:
+def measured(server: FoundServer, gpus: Sequence[Mapping[str, Any]]) -> FoundServer:
     """Return a server with the bytes of its processes, on the GPU that has most of them."""
     held: dict[str, int] = {}
     for gpu in gpus:

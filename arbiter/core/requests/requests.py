@@ -5,7 +5,7 @@ Permission: leases belong to a process, so a request on a lease must come from a
 process. Uses (`uses`) are open to any client that knows the exact token.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from vram_arbiter.arbiter.core import events as ev
@@ -19,7 +19,7 @@ from vram_arbiter.arbiter.core.report import status
 from vram_arbiter.arbiter.core.report.why import ahead_of, explain
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.arbiter.core.verification.schedule import begin_for_lease
-from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.codes import Why
 from vram_arbiter.schemas.wire.errors import Refusal
@@ -107,7 +107,7 @@ def acquire(core: Core, asked: ev.Asked, request: w.Acquire) -> None:
     """
     client, spec = core.clients[asked.client], request.spec
     if spec.cgroup is not None:  # 0
-        _check_cgroup(core, client, spec.cgroup)
+        _check_cgroup(core.leases.values(), client.process, spec.cgroup)
     known = _known_by(core, client, request.nonce)
     mine = core.leases_of(client.process) if core.away else []
     away = standby.wanted(mine, request, known) if mine else None
@@ -128,12 +128,12 @@ def acquire(core: Core, asked: ev.Asked, request: w.Acquire) -> None:
     core.enqueue(_new_lease(core, asked, request, load_peak, steady, gpus))  # 6
 
 
-def _check_cgroup(core: Core, client: Client, cgroup: str) -> None:
+def _check_cgroup(leases: Iterable[Lease], process: ProcessKey, cgroup: str) -> None:
     """Raises Refused where another process's lease names an overlapping cgroup: bytes would have
     two holders."""
-    for lease in core.leases.values():
+    for lease in leases:
         other = lease.spec.cgroup
-        if other is not None and lease.process != client.process:
+        if other is not None and lease.process != process:
             shorter, longer = sorted((f"{other}/", f"{cgroup}/"), key=len)
             if longer.startswith(shorter):
                 raise Refused(no.CgroupTaken(cgroup, lease.id, lease.spec.consumer, other))

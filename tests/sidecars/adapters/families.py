@@ -1,4 +1,4 @@
-"""Policy families for tests: manifests, observations, answers, and lerobot's own loop beside them."""
+"""Policy families for tests: manifests, observations, answers, and lerobot's own loop."""
 
 import shutil
 from pathlib import Path

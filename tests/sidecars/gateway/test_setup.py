@@ -21,12 +21,14 @@ from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.sidecars.gateway import setup
 from vram_arbiter.sidecars.gateway.__main__ import main
-from vram_arbiter.sidecars.gateway.setup import Found, Server, config_text
+from vram_arbiter.sidecars.gateway.setup import Found, FoundServer, config_text
 
 GIB = 1 << 30
 KEYS_FILE = Path("/etc/vram-arbiter/gateway-keys.yaml")
 GPU = {"gpu": "GPU-0", "name": "RTX", "capacity_bytes": 8 * GIB, "processes": []}
-OLLAMA = Server("ollama", "unit", "ollama.service", 11434, on_evict="ollama", held_bytes=3 * GIB)
+OLLAMA = FoundServer(
+    "ollama", "unit", "ollama.service", 11434, on_evict="ollama", held_bytes=3 * GIB
+)
 ENDPOINT = "ipc:///run/vram-arbiter/arbiter.sock"
 EXEC = "{{ path={0} ; argv[]={1} ; ignore_errors=no ; start_time=[n/a] }}"
 
@@ -169,7 +171,7 @@ def served(request: pytest.FixtureRequest) -> Iterator[int]:
 def test_a_server_is_what_its_endpoints_say(
     served: int, kind: str, on_evict: str, models: tuple[str, ...]
 ) -> None:
-    found = setup.asked(Server("", "pid", "", served))
+    found = setup.asked(FoundServer("", "pid", "", served))
     assert (found.kind, found.on_evict, found.models) == (kind, on_evict, models)
 
 
@@ -196,9 +198,11 @@ def test_bytes_are_those_of_the_cgroup_or_the_process() -> None:
 
 # -- the file
 def test_the_file_has_what_is_known_and_comments_for_the_rest() -> None:
-    vllm = Server("vllm", "container", "big", 8000, held_bytes=5 * GIB + 1, models=("Q", "ollama"))
-    hand = Server("llama.cpp", "pid", "llama.cpp", 8080, "llama-server -m x", held_bytes=GIB)
-    cold = Server("comfyui", "unit", "comfy.service", 8188)
+    vllm = FoundServer(
+        "vllm", "container", "big", 8000, held_bytes=5 * GIB + 1, models=("Q", "ollama")
+    )
+    hand = FoundServer("llama.cpp", "pid", "llama.cpp", 8080, "llama-server -m x", held_bytes=GIB)
+    cold = FoundServer("comfyui", "unit", "comfy.service", 8188)
     twin = replace(OLLAMA, where="container", name="ollama", port=11435)
     servers = [OLLAMA, vllm, hand, cold, twin]
     text = config_text(
@@ -225,7 +229,9 @@ def test_the_file_has_what_is_known_and_comments_for_the_rest() -> None:
 
 
 def test_names_of_others_stay_inside_their_comment() -> None:
-    hostile = Server("vllm", "pid", "vllm", 8000, "vllm serve\nservers: {evil: {}}", held_bytes=GIB)
+    hostile = FoundServer(
+        "vllm", "pid", "vllm", 8000, "vllm serve\nservers: {evil: {}}", held_bytes=GIB
+    )
     text = config_text(Found([GPU], [OLLAMA, hostile], frozenset(), ["comfy"]), KEYS_FILE)
     assert list(load_gateway(text, "gateway.yaml").servers) == ["ollama"]
     assert "# comfy is installed: add a `command` for it" in text
