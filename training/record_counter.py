@@ -27,6 +27,7 @@ MANIFEST: Final = Path(__file__).parents[1] / "configs/rskills/panda-grab/rskill
 CHUNKS: Final = 20  # a pick ends within these
 OPEN_STEPS: Final = 90  # the fingers seldom close before
 MISSES: Final = 0.5
+SWAYS_RAD: Final = (0.0, 0.1, 0.2, 0.1, 0.2, 0.3)  # arm poses of one hold: around its own
 
 
 def pick(
@@ -95,7 +96,10 @@ def stand_before(env: SimEnv, name: str, rng: random.Random) -> None:
 
 
 def shots(world: ArmEnvironment, manifest: RSkillManifest, seed: int) -> Iterator[Shot]:
-    """Yield the frames of one layout: start, way, grabbing, after. Half of the grabs misses."""
+    """Yield the frames of one layout: start, way, grabbing, after. Half of the grabs misses.
+
+    Views of a hold cost little beside the grab, and are what the model is asked about most.
+    """
     env, rng = world.arm, random.Random(f"counter-{seed}")
     world.reset(seed)
     yield shoot(env, "wrist", "start")
@@ -112,7 +116,7 @@ def shots(world: ArmEnvironment, manifest: RSkillManifest, seed: int) -> Iterato
             yield shoot(env, "wrist", "grabbing")
     # the same hold in other arm poses, seen from elsewhere
     lifted: dict[str, Any] = dict(world.sent())
-    for sway in (0.0, 0.1, 0.2):
+    for sway in SWAYS_RAD:
         pose = {joint: angle + rng.uniform(-sway, sway) for joint, angle in lifted.items()}
         pose["panda_gripper"] = lifted["panda_gripper"]
         turn = (rng.uniform(-0.2, 0.0), rng.uniform(-0.2, 0.2), rng.uniform(-0.3, 0.3))

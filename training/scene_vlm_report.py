@@ -17,7 +17,7 @@ from training.common import Report, median_ms, share
 from training.datasets import Frame
 from vram_arbiter.schemas.plain import JsonObject
 
-GRASPED = ("held", "holds another", "empty")
+GRASPED = ("held", "holds another of its color", "holds another", "empty")
 WHOLE = ("what is held", "list")  # here the whole answer has to be right, not its yes or no
 
 
@@ -60,8 +60,8 @@ def questions_about(
     """Return group, question and true answer for each question about a frame.
 
     Every frame is asked whether its target is grasped: the held object (`held`), another one while
-    an object is held (`holds another`), a present one while the gripper is empty (`empty`); then
-    what is held and what shows.
+    an object is held (`holds another`, of its color where the scene has one), a present one while
+    the gripper is empty (`empty`); then what is held and what shows.
     """
     pairs: list[tuple[str, tuple[str, str]]] = []
     others = [name for name in frame.present if name != frame.held]
@@ -69,8 +69,10 @@ def questions_about(
         pairs.append(("empty", questions.grasped(rng, rng.choice(others), None)))
     else:
         pairs.append(("held", questions.grasped(rng, frame.held, frame.held)))
-        other = rng.choice(questions.alike(frame.held, others) or others)
-        pairs.append(("holds another", questions.grasped(rng, other, frame.held)))
+        same = [name for name in others if name.split()[0] == frame.held.split()[0]]
+        other = rng.choice(same or questions.alike(frame.held, others) or others)
+        group = "holds another of its color" if same else "holds another"
+        pairs.append((group, questions.grasped(rng, other, frame.held)))
     pairs.append(("what is held", questions.holding(rng, frame.held)))
     clear = [name for name in names if name not in frame.hidden]
     pairs.append(("in view?", questions.present(rng, rng.choice(clear), frame.visible)))
