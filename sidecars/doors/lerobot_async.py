@@ -48,7 +48,7 @@ SERVICE: Final = "transport.AsyncInference"
 WAIT_S: Final = 2.0
 """How long a request for actions waits for an observation, as at lerobot's server."""
 STREAM_S: Final = 10.0  # how long one observation may take to arrive
-BEGIN_S: Final = 0.5  # of a request that a robot sends once: the next one comes no sooner
+BEGIN_S: Final = 0.2  # of a request that a robot sends once: the next one comes no sooner
 CHUNKS_MAX: Final = 64  # of one observation: lerobot's are of 2 MiB, but for the last
 REQUESTS_MAX: Final = 256  # at a time, of all robots
 MESSAGE_MAX_BYTES: Final = 4 * MIB  # lerobot's clients send 2 MiB at most

@@ -1,12 +1,15 @@
 """lerobot's stock robot_client at a sidecar's door, unmodified, with a robot of this test."""
 
+import dataclasses
 import importlib
 import os
 import pickle
+import re
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -136,19 +139,20 @@ def test_several_robots_are_served_at_once(make_client: Callable[..., Any]) -> N
 
 
 def test_nothing_is_loaded_that_a_stranger_names(
-    make_client: Callable[..., Any], lerobot: Any, tmp_path: Path
+    make_client: Callable[..., Any], door: Served, tmp_path: Path
 ) -> None:
-    import grpc
+    client = make_client("attacker/model")
+    assert not client.start()
+    client.stop()
 
-    for skill in ("attacker/model", str(tmp_path), "../configs/models/so101-grab"):
-        client = make_client(skill)
-        assert not client.start()
-        setup = lerobot.services_pb2.PolicySetup(data=pickle.dumps(client.policy_config))
-        with pytest.raises(grpc.RpcError) as refused:
-            client.stub.SendPolicyInstructions(setup)
-        assert refused.value.code() is grpc.StatusCode.NOT_FOUND
-        assert f"is one of: {GRAB}" in refused.value.details()
-        client.stop()
+    def asks_for(skill: str) -> Callable[[Peer], str]:
+        config = dataclasses.replace(client.policy_config, pretrained_name_or_path=skill)
+        return lambda peer: peer.instruct(config)
+
+    skills = ("attacker/model", str(tmp_path), "../configs/models/so101-grab")
+    for told in at_once(door.address, [asks_for(skill) for skill in skills]):
+        assert told.startswith("NOT_FOUND: unknown_skill")
+        assert f"is one of: {GRAB}" in told
 
 
 def test_a_robot_waits_for_an_evicted_model_and_gets_no_old_actions(
@@ -203,6 +207,21 @@ class Peer:
         return "OK"
 
 
+def at_once(address: str, attacks: Sequence[Callable[[Peer], str]]) -> list[str]:
+    """Return what each attack was told, of a connection of its own: after a refusal it is not read
+    for a second."""
+
+    def alone(attack: Callable[[Peer], str]) -> str:
+        peer = Peer(address)
+        try:
+            return attack(peer)
+        finally:
+            peer.channel.close()
+
+    with ThreadPoolExecutor(len(attacks)) as pool:
+        return list(pool.map(alone, attacks))
+
+
 class Touches:
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -216,40 +235,52 @@ def test_attackers_are_refused_while_a_robot_is_served(
 ) -> None:
     import grpc
 
+    from vram_arbiter.sidecars.doors.lerobot_async import CHUNKS_MAX
+
     client = make_client()
     mark = tmp_path / "ran"
+    hostile, gzip = pickle.dumps(Touches(mark)), grpc.Compression.Gzip
+
+    def instructed(data: bytes, count: int = 1) -> Callable[[Peer], str]:
+        def attack(peer: Peer) -> str:
+            assert peer.instruct(client.policy_config) == "OK"
+            return peer.observe(iter([*[(2, data)] * count, (3, b"")]))
+
+        return attack
+
+    attacks: list[tuple[Callable[[Peer], str], str]] = [
+        (lambda peer: peer.observe(iter([(3, b"")])), "FAILED_PRECONDITION: bad_state"),
+        (lambda peer: peer.instruct(hostile), "INVALID_ARGUMENT.*names 'posix.system'"),
+        (lambda peer: peer.instruct(b"\x80\x04" + b"]" * 32_000), "RESOURCE_EXHAUSTED"),
+        (lambda peer: peer.instruct(b"no pickle"), "INVALID_ARGUMENT: bad_request"),
+        (lambda peer: peer.instruct(pickle.dumps([1])), "INVALID_ARGUMENT: bad_request"),
+        (lambda peer: peer.instruct(bytes(MIB)), "RESOURCE_EXHAUSTED: limit_exceeded: instr"),
+        (lambda peer: peer.instruct(bytes(5 * MIB)), "RESOURCE_EXHAUSTED"),  # gRPC's own limit
+        (
+            lambda peer: peer.instruct(bytes(64 * MIB), compression=gzip),
+            "RESOURCE_EXHAUSTED: Decompressed message",
+        ),
+        (instructed(hostile), "INVALID_ARGUMENT: bad_request: a pickle that names 'posix.system'"),
+        (instructed(b"\x80\x04Nr\xff\xff\xff\x7fN."), "INVALID_ARGUMENT: bad_request"),
+        (instructed(pickle.dumps({})), "INVALID.*expected a TimedObservation"),
+        (instructed(bytes(2 * MIB), 9), "RESOURCE_EXHAUSTED: limit_exceeded: an observation of"),
+        (instructed(b"", CHUNKS_MAX), "RESOURCE_EXHAUSTED: limit_exceeded: an observation of"),
+    ]
     with at_work(client) as robot:
-        plays_on(robot)
+        plays_on(robot, CHUNK)
         before = door.rss_bytes()
-        peer = Peer(door.address)
-        assert peer.observe(iter([(3, b"")])).startswith("FAILED_PRECONDITION: bad_state")
-        hostile = pickle.dumps(Touches(mark))
-        assert "names 'posix.system'" in peer.instruct(hostile)
-        assert peer.instruct(b"\x80\x04" + b"]" * MIB).startswith("RESOURCE_EXHAUSTED")
-        assert peer.instruct(b"no pickle").startswith("INVALID_ARGUMENT: bad_request")
-        assert peer.instruct(pickle.dumps([1])).startswith("INVALID_ARGUMENT: bad_request")
-        assert peer.instruct(bytes(5 * MIB)).startswith("RESOURCE_EXHAUSTED"), "gRPC's own limit"
-        bomb = peer.instruct(bytes(64 * MIB), compression=grpc.Compression.Gzip)
-        assert bomb.startswith("RESOURCE_EXHAUSTED: Decompressed message")
-        assert peer.instruct(client.policy_config) == "OK"
-        for data, status in (
-            (hostile, "INVALID_ARGUMENT: bad_request: a pickle that names 'posix.system'"),
-            (b"\x80\x04Nr\xff\xff\xff\x7fN.", "INVALID_ARGUMENT: bad_request"),
-            (pickle.dumps({}), "INVALID_ARGUMENT: bad_request: expected a TimedObservation"),
+        for told, expected in zip(
+            at_once(door.address, [attack for attack, _ in attacks]),
+            [expected for _, expected in attacks],
+            strict=True,
         ):
-            assert peer.observe(iter([(1, data), (3, b"")])).startswith(status)
-        endless = ((2, bytes(2 * MIB)) for _ in iter(int, 1))
-        assert peer.observe(endless).startswith(
-            "RESOURCE_EXHAUSTED: limit_exceeded: an observation of"
-        )
-        plays_on(robot)
+            assert re.match(expected, told), told
         crowd = [
             socket.create_connection(("127.0.0.1", door.port)) for _ in range(4 * CONNECTIONS_MAX)
         ]
-        plays_on(robot)
+        plays_on(robot, CHUNK)
         for one in crowd:
             one.close()
-        peer.channel.close()
         assert door.rss_bytes() - before < 128 * MIB
     assert not mark.exists()
     assert "Traceback" not in door.log.read_text()
