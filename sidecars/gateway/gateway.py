@@ -48,6 +48,8 @@ class _Handler(RequestHandler):
         exc: BaseException | None = None,
         message: str | None = None,
     ) -> web.StreamResponse:
+        if isinstance(exc, ConnectionError):  # the client left, or does not read
+            raise exc
         if status >= 500:
             return super().handle_error(request, status, exc, message)
         why = (message or "").partition("\n")[0][:TOLD_MAX]
