@@ -10,6 +10,7 @@ tools, it plans. Any other path answers what it was asked.
 
 import asyncio
 import os
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -97,13 +98,20 @@ def planned(*, done: bool) -> object:
     return OpenAi.says(("execute_rskill__lab__go", "{}"))
 
 
+async def serve(server: OpenAiServer, port: int) -> None:
+    runner = web.AppRunner(server.app(), shutdown_timeout=0.1)
+    await runner.setup()
+    stop = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
+    await web.TCPSite(runner, "127.0.0.1", port).start()
+    print(f"serves on {port}", flush=True)
+    await stop.wait()
+    await runner.cleanup()
+
+
 def main(folder: str, size: str, port: str) -> None:
     held = HeldBytes(folder, size)
-    app = OpenAiServer(Path(folder), held.free, held.load).app()
-    print(f"serves on {port}", flush=True)
-    web.run_app(
-        app, host="127.0.0.1", port=int(port), print=None, access_log=None, shutdown_timeout=0.1
-    )
+    asyncio.run(serve(OpenAiServer(Path(folder), held.free, held.load), int(port)))
     held.close()
 
 
