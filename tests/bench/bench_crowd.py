@@ -1,12 +1,10 @@
 """Many at once: ten thousand live leases, ten thousand waiters' memory, ten thousand connections
 that vanish in one moment, a flood."""
 
-import os
 import signal
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 
 from tests.bench.harness import (
     ANSWER_TIMEOUT_S,
@@ -22,6 +20,7 @@ from tests.bench.harness import (
     pause,
     spawn,
 )
+from tests.support.processes import rss_bytes
 
 PER_CONNECTION = 128
 CROWD_PROCESSES = 4
@@ -89,10 +88,6 @@ def fill_history(peer: Peer) -> None:
     for _ in range(1200):
         lease = peer.reply(peer.want())["lease"]
         peer.ask("cancel", lease_id=lease["lease_id"])
-
-
-def rss_bytes(pid: int) -> int:
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def disconnects(suite: Suite) -> None:

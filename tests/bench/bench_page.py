@@ -11,11 +11,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from tests.bench.bench_crowd import rss_bytes
 from tests.bench.bench_rest import QUIET_AFTER_S, busy_percent
 from tests.bench.harness import SHIPPED, WIDE, Peer, Suite, arbiter, elapsed_us, in_turns, pause
 from tests.support.observer import ObserverProcess
 from tests.support.process import ArbiterProcess
+from tests.support.processes import rss_bytes
 
 LEASES = 1000
 PER_CONNECTION = 64

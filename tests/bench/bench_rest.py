@@ -5,8 +5,8 @@ import sys
 import time
 from pathlib import Path
 
-from tests.bench.bench_crowd import rss_bytes
 from tests.bench.harness import SHIPPED, Peer, Suite, arbiter, elapsed_us, environ, in_turns, pause
+from tests.support.processes import rss_bytes
 
 QUIET_AFTER_S = 11.0
 """The GPU is read in the background until 10 s after the last client."""

@@ -59,7 +59,7 @@ def index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def calls(index: Path) -> list[str]:
+def uv_calls(index: Path) -> list[str]:
     return (index / "uv.log").read_text().split()
 
 
@@ -68,17 +68,17 @@ def test_an_environment_is_made_once_and_anew_where_it_is_broken(index: Path) ->
         made, same = pool.map(lambda _: environment(TINY, os.environ), range(2))
     assert made == same
     assert made.parent == index / "cache/vram-arbiter/environments"
-    assert calls(index) == ["venv", "pip"]
+    assert uv_calls(index) == ["venv", "pip"]
     ask = "import zmq, msgpack, vram_arbiter; print(zmq.HERE)"
     told = subprocess.run([made / "bin/python", "-P", "-c", ask], capture_output=True, text=True)
     assert told.stdout == "True\n", told.stderr  # its own first, this installation's behind
     assert environment([], os.environ) != made
-    assert calls(index) == ["venv", "pip", "venv"]
+    assert uv_calls(index) == ["venv", "pip", "venv"]
     for broken in ("bin/python", "requirements.txt"):
         (made / broken).unlink()
         assert environment(TINY, os.environ) == made
         assert (made / broken).exists()
-    assert calls(index)[3:] == ["venv", "pip"] * 2
+    assert uv_calls(index)[3:] == ["venv", "pip"] * 2
 
 
 @pytest.mark.heavy

@@ -26,7 +26,7 @@ def encoded(
     return stream.getvalue()
 
 
-def chunk(kind: bytes, content: bytes = b"") -> bytes:
+def png_chunk(kind: bytes, content: bytes = b"") -> bytes:
     return (
         struct.pack(">I", len(content))
         + kind
@@ -36,9 +36,9 @@ def chunk(kind: bytes, content: bytes = b"") -> bytes:
 
 
 def png(width: int, height: int, depth: int = 8, color: int = 2, *more: bytes) -> bytes:
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0))
-    pixels = chunk(b"IDAT", zlib.compress(bytes(100)))
-    return b"\x89PNG\r\n\x1a\n" + head + b"".join(more) + pixels + chunk(b"IEND")
+    head = png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0))
+    pixels = png_chunk(b"IDAT", zlib.compress(bytes(100)))
+    return b"\x89PNG\r\n\x1a\n" + head + b"".join(more) + pixels + png_chunk(b"IEND")
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_a_jpeg_of_thousands_of_scans_costs_nothing() -> None:
         (png(16_000, 16_000), "more than 16777216 pixels"),
         (png(8, 8, 16, 0), "16 bits a sample"),
         (png(8, 8, 8, 7), "color type 7"),
-        (png(8, 8, 8, 2, *[chunk(b"IDAT")] * 9_000), "more than 8192 chunks"),
+        (png(8, 8, 8, 2, *[png_chunk(b"IDAT")] * 9_000), "more than 8192 chunks"),
         (b"\xff\xd8" + b"\xff\xe1\x00\x02" * 5_000, "more than 1000 segments"),
         (b"\xff\xd8" + b"\xff" * 100_000, "more than 1000 segments"),
         (b"\xff\xd8junk", "do not join"),

@@ -78,7 +78,7 @@ async def operate(
     return await goal.result(), truth
 
 
-async def play(folder: Path, seed: int, *flags: str) -> tuple[ResultPush, dict[str, Any]]:
+async def play_program(folder: Path, seed: int, *flags: str) -> tuple[ResultPush, dict[str, Any]]:
     """Run the program with files and socket in a folder; as `operate`."""
     track, file, endpoint = folder / "track.json", folder / "robot.yaml", f"ipc://{folder}/r.sock"
     transport = {"path": str(track), "joints": list(ARM_JOINTS), "step_s": STEP_S}
@@ -96,4 +96,4 @@ async def play(folder: Path, seed: int, *flags: str) -> tuple[ResultPush, dict[s
 if __name__ == "__main__":
     out = Path(sys.argv[1]).resolve()
     out.mkdir(parents=True, exist_ok=True)
-    print(asyncio.run(play(out, 0, "--video", str(out / "episode.mp4"))))
+    print(asyncio.run(play_program(out, 0, "--video", str(out / "episode.mp4"))))

@@ -17,6 +17,11 @@ def until[T](condition: Callable[[], T], deadline_s: float = PATIENCE_S) -> T:
     return found
 
 
+async def eventually(condition: Callable[[], object]) -> None:
+    """Wait as `until`, without holding up the event loop."""
+    await asyncio.to_thread(until, condition)
+
+
 def play[T](story: Callable[[], Awaitable[T]], limit_s: float = PATIENCE_S) -> T:
     """Run a story in an event loop of its own, and return its result; TimeoutError at the limit."""
 

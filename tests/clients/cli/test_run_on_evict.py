@@ -17,11 +17,11 @@ import pytest
 from tests.support.leases import view_of
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess, vramctl
+from tests.support.processes import alive
 from tests.support.waiting import until
 from vram_arbiter.clients.cli.run import check_gpus
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import GpuView
 
@@ -96,11 +96,6 @@ def server(
     urls = [option.replace("URL", f"http://{HOST}:{port}") for option in options]
     with running(arbiter, "--on-evict", action, *urls, "--", *command) as run:
         yield run, int(run.line())
-
-
-def alive(pid: int) -> bool:
-    stat = procfs.read_stat(pid)
-    return stat is not None and stat.alive
 
 
 def used_bytes(client: Client) -> int:

@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from tests.support.leases import view_of
 from tests.support.process import ArbiterProcess
 from tests.support.processes import children
 from tests.support.tiny_gguf import write_gguf
-from tests.support.waiting import PATIENCE_S, until
+from tests.support.waiting import PATIENCE_S, eventually
 from vram_arbiter.clients.foreign.servers import LlamaCpp
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.sidecars.gateway.program import free_port
@@ -107,7 +107,7 @@ async def test_a_stream_and_a_load_of_a_real_router_end_before_it_unloads(
             finally:
                 lease.release()
 
-        await _eventually(lambda: arbiter.status().leases and state() == "held")
+        await eventually(lambda: arbiter.status().leases and state() == "held")
 
         # in the middle of a stream
         asked = {**COMPLETION, "model": "one", "n_predict": WORDS, "stream": True}
@@ -115,30 +115,26 @@ async def test_a_stream_and_a_load_of_a_real_router_end_before_it_unloads(
             lines = answer.iter_lines()
             next(lines)
             other = asyncio.create_task(asyncio.to_thread(take_the_room))
-            await _eventually(lambda: state() == "unloading")
+            await eventually(lambda: state() == "unloading")
             assert router.preset.busy() == 1
             assert router.states()["one"] == "loaded"
             last: dict[str, Any] = json.loads([line for line in lines if line][-1][6:])
         assert last["tokens_predicted"] == WORDS
         await other
-        await _eventually(lambda: state() == "held")  # it is back
+        await eventually(lambda: state() == "held")  # it is back
 
         # in the middle of a load
         asked = {**COMPLETION, "model": "two", "n_predict": 5}
         whole = asyncio.create_task(
             asyncio.to_thread(router.client.post, "/completion", json=asked)
         )
-        await _eventually(lambda: router.loaders)
+        await eventually(lambda: router.loaders)
         (loader,) = router.loaders
         os.kill(loader, signal.SIGSTOP)
         assert router.states()["two"] == "loading"
         other = asyncio.create_task(asyncio.to_thread(take_the_room))
-        await _eventually(lambda: state() == "unloading")
+        await eventually(lambda: state() == "unloading")
         assert router.preset.busy() == 1
         os.kill(loader, signal.SIGCONT)
         assert (await whole).json()["tokens_predicted"] == 5
         await other
-
-
-async def _eventually(condition: Callable[[], object]) -> None:
-    await asyncio.to_thread(until, condition)

@@ -38,7 +38,7 @@ exec cat "$(basename "$0").$name"
 
 
 @pytest.fixture
-def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder in which the programs stand and work."""
     for name, text in (
         ("systemctl", SYSTEMCTL),
@@ -53,14 +53,14 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def unit(machine: Path, name: str = "llm.service", slice_: str = "system.slice") -> None:
+def unit(tools: Path, name: str = "llm.service", slice_: str = "system.slice") -> None:
     text = f"Id={name}\nLoadState=loaded\nSlice={slice_}\n"
-    (machine / f"{name}.shown").write_text(text)
+    (tools / f"{name}.shown").write_text(text)
 
 
-def container(machine: Path, engine: str, **host: str) -> None:
+def add_container(tools: Path, engine: str, **host: str) -> None:
     told = [{"Id": IDENTITY, "State": {"Pid": 0}, "HostConfig": host}]
-    (machine / f"{engine}.llm").write_text(json.dumps(told))
+    (tools / f"{engine}.llm").write_text(json.dumps(told))
 
 
 # -- by name
@@ -73,11 +73,11 @@ def container(machine: Path, engine: str, **host: str) -> None:
     ],
 )
 def test_the_cgroup_of_a_unit_that_does_not_run_is_known_by_its_slice(
-    machine: Path, slice_: str, cgroup: str
+    tools: Path, slice_: str, cgroup: str
 ) -> None:
-    unit(machine, slice_=slice_)
+    unit(tools, slice_=slice_)
     assert find_unit("llm.service").cgroup == cgroup
-    (machine / "llm.service.runs").write_text("/elsewhere/llm.service\n")
+    (tools / "llm.service.runs").write_text("/elsewhere/llm.service\n")
     assert find_unit("llm.service").cgroup == "/elsewhere/llm.service", "one that runs, says"
 
 
@@ -100,15 +100,15 @@ def test_the_cgroup_of_a_unit_that_does_not_run_is_known_by_its_slice(
     ],
 )
 def test_the_cgroup_of_a_container_that_does_not_run_is_known_by_its_engine(
-    machine: Path, engine: str, host: dict[str, str], cgroup: str
+    tools: Path, engine: str, host: dict[str, str], cgroup: str
 ) -> None:
-    container(machine, engine, **host)
+    add_container(tools, engine, **host)
     found = find_container("llm", 1.5)
     assert found.cgroup == cgroup
     assert found.stop == (engine, "stop", "--time=2", "--", "llm")
 
 
-def test_the_cgroup_of_a_container_that_runs_is_its_process_s(machine: Path) -> None:
+def test_the_cgroup_of_a_container_that_runs_is_its_process_s(tools: Path) -> None:
     """Down to the folder with its id: what its own init makes below is not its name."""
     root = procfs.cgroup_root()
     if root is None:
@@ -124,7 +124,7 @@ def test_the_cgroup_of_a_container_that_runs_is_its_process_s(machine: Path) -> 
             assert inside.stdout is not None
             inside.stdout.readline()
             told = [{"Id": IDENTITY, "State": {"Pid": inside.pid}}]
-            (machine / "podman.llm").write_text(json.dumps(told))
+            (tools / "podman.llm").write_text(json.dumps(told))
             assert find_container("llm", None).cgroup == f"/{own.relative_to(root)}"
             inside.communicate(b"")
     finally:
@@ -133,16 +133,16 @@ def test_the_cgroup_of_a_container_that_runs_is_its_process_s(machine: Path) -> 
 
 
 @pytest.mark.parametrize("name", ["", "-x", "a b", "a/b", "a\n", "x" * 256])
-def test_what_is_no_name_is_given_to_no_program(machine: Path, name: str) -> None:
+def test_what_is_no_name_is_given_to_no_program(tools: Path, name: str) -> None:
     with pytest.raises(ConfigError, match="not a name"):
         find_unit(name)
     with pytest.raises(ConfigError, match="not a name"):
         find_container(name, None)
-    assert not (machine / "calls").exists()
+    assert not (tools / "calls").exists()
 
 
-def test_what_is_not_there_is_said(machine: Path) -> None:
-    (machine / "llm.socket.shown").write_text("Id=llm.socket\nLoadState=loaded\nSlice=a.slice\n")
+def test_what_is_not_there_is_said(tools: Path) -> None:
+    (tools / "llm.socket.shown").write_text("Id=llm.socket\nLoadState=loaded\nSlice=a.slice\n")
     for name in ("llm.service", "llm.socket"):
         with pytest.raises(ConfigError, match="no service 'llm"):
             find_unit(name)
@@ -154,7 +154,7 @@ def test_what_is_not_there_is_said(machine: Path) -> None:
     "words", [["--unit", "a", "--", "b"], ["--unit", "a", "--container", "b"], []]
 )
 def test_one_thing_is_run_and_no_other(
-    machine: Path, words: list[str], capsys: pytest.CaptureFixture[str]
+    tools: Path, words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
         run_main(["run", "--vram", "1GiB", *words])
@@ -163,18 +163,18 @@ def test_one_thing_is_run_and_no_other(
 
 
 def test_a_unit_that_is_not_there_is_wrong_use(
-    machine: Path, capsys: pytest.CaptureFixture[str]
+    tools: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run_main(["run", "--vram", "1GiB", "--unit", "llm"]) == 2
     assert "there is no service 'llm'" in capsys.readouterr().err
 
 
 # -- running
-def running(
-    machine: Path, test: Callable[[ServiceProgram], Awaitable[None]], cgroup: str | None = None
+def run_unit(
+    tools: Path, test: Callable[[ServiceProgram], Awaitable[None]], cgroup: str | None = None
 ) -> None:
     """Run a unit, in the cgroup that its lease names unless another is given."""
-    unit(machine)
+    unit(tools)
     found = find_unit("llm.service")
     placed = found if cgroup is None else Service(
         found.name, cgroup, found.run, found.stop, found.kill, found.log, found.look
@@ -183,7 +183,7 @@ def running(
     async def run() -> None:
         async with asyncio.timeout(PATIENCE_S):
             program = ServiceProgram(placed)
-            while not await asyncio.to_thread((machine / f"{placed.name}.runs").exists):
+            while not await asyncio.to_thread((tools / f"{placed.name}.runs").exists):
                 await asyncio.sleep(0.02)
             await test(program)
             assert not program.running
@@ -191,9 +191,9 @@ def running(
     asyncio.run(run())
 
 
-def calls(machine: Path) -> list[str]:
+def calls(tools: Path) -> list[str]:
     """Commands that did something."""
-    lines = (machine / "calls").read_text().splitlines()
+    lines = (tools / "calls").read_text().splitlines()
     return [line.removeprefix("--no-ask-password ") for line in lines if " show " not in line]
 
 
@@ -201,21 +201,21 @@ START = "start -- llm.service"
 STOP = "stop -- llm.service"
 
 
-def test_one_that_ends_itself_gives_its_result_and_its_last_lines(machine: Path) -> None:
+def test_one_that_ends_itself_gives_its_result_and_its_last_lines(tools: Path) -> None:
     async def test(program: ServiceProgram) -> None:
-        with (machine / "llm.service.shown").open("a") as shown:
+        with (tools / "llm.service.shown").open("a") as shown:
             shown.write("Result=exit-code\nExecMainStatus=7\n")
-        (machine / "llm.service.runs").unlink()
+        (tools / "llm.service.runs").unlink()
         assert await program.wait() == 7
         assert await program.end(1.0) is False
 
-    running(machine, test)
+    run_unit(tools, test)
     log = "--unit=llm.service --lines=20 --output=cat --quiet"
-    assert calls(machine) == [START, STOP, log], "its manager does not start it again by itself"
+    assert calls(tools) == [START, STOP, log], "its manager does not start it again by itself"
 
 
 @pytest.mark.parametrize("by", ["end", signal.SIGTERM, signal.SIGINT])
-def test_it_is_stopped_in_order(machine: Path, by: str | signal.Signals) -> None:
+def test_it_is_stopped_in_order(tools: Path, by: str | signal.Signals) -> None:
     async def test(program: ServiceProgram) -> None:
         if isinstance(by, str):
             assert await program.end(None) is False
@@ -224,29 +224,29 @@ def test_it_is_stopped_in_order(machine: Path, by: str | signal.Signals) -> None
             program.send_signal(by)
         assert await program.wait() == 0
 
-    running(machine, test)
-    assert set(calls(machine)) == {START, STOP}
+    run_unit(tools, test)
+    assert set(calls(tools)) == {START, STOP}
 
 
-def test_one_that_does_not_stop_in_time_is_killed(machine: Path) -> None:
-    (machine / "deaf").touch()
+def test_one_that_does_not_stop_in_time_is_killed(tools: Path) -> None:
+    (tools / "deaf").touch()
 
     async def test(program: ServiceProgram) -> None:
         assert await program.end(0.05) is True
         assert await program.wait() == 9
 
-    running(machine, test)
-    assert calls(machine)[:3] == [START, STOP, "kill --signal=SIGKILL -- llm.service"]
+    run_unit(tools, test)
+    assert calls(tools)[:3] == [START, STOP, "kill --signal=SIGKILL -- llm.service"]
 
 
 def test_one_outside_the_cgroup_of_its_lease_is_ended(
-    machine: Path, capfd: pytest.CaptureFixture[str]
+    tools: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Nothing would charge its bytes to the lease."""
 
     async def test(program: ServiceProgram) -> None:
         assert await program.wait() == 1
 
-    running(machine, test, cgroup="/system.slice/llm")
-    assert set(calls(machine)) == {START, STOP}
+    run_unit(tools, test, cgroup="/system.slice/llm")
+    assert set(calls(tools)) == {START, STOP}
     assert "runs in the cgroup /system.slice/llm.service, not in" in capfd.readouterr().err

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("lerobot", reason="needs the sidecars extra")
 
-from tests.support.operated import play
+from tests.support.operated import play_program
 from vram_arbiter.runner.__main__ import main
 
 pytestmark = pytest.mark.heavy
@@ -23,7 +23,7 @@ def test_an_operator_takes_a_goal_over_and_grabs(
 ) -> None:
     """It is filmed: docs/teleop.webp."""
     monkeypatch.syspath_prepend(str(PLUGIN))
-    result, truth = asyncio.run(play(tmp_path, 0))
+    result, truth = asyncio.run(play_program(tmp_path, 0))
     assert (result["status"], result["data"]["ended_by"]) == ("succeeded", "operator")
     assert truth["held"] == truth["target"]
 

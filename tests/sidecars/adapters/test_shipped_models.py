@@ -138,7 +138,7 @@ def test_the_scene_vlm_answers_as_its_card_says(scenes: range):
 
 
 @pytest.fixture
-def panda():
+def panda_world():
     pytest.importorskip("mink")
     if find_spec("robosuite") is None:
         pytest.skip("needs robosuite's files: .ci/setup full")
@@ -154,27 +154,27 @@ def grab(world, skill, target: str) -> None:
 
 @pytest.mark.nightly  # 60 grabs; the next test plays two
 @pytest.mark.timeout(1800)
-def test_the_pandas_scene_vlm_answers_as_its_card_says(panda):
+def test_the_pandas_scene_vlm_answers_as_its_card_says(panda_world):
     exam, manifest = Exam("panda-scene-vlm"), load_manifest(record_counter.MANIFEST)
-    env = panda.arm
+    env = panda_world.arm
     for seed in range(900, 930):
         for skill in (record_counter.missing(random.Random(seed), manifest), manifest):
-            panda.reset(seed)
+            panda_world.reset(seed)
             target, other = env.layout.objects[0].name, env.layout.objects[1].name
             assert exam.answer(env, "What is the gripper holding?") == "The gripper is empty."
             record_counter.stand_before(env, target, random.Random(seed))
-            grab(panda, skill, target)
+            grab(panda_world, skill, target)
             exam.ask(env, target)
             exam.ask(env, other)
         assert env.held_object(), "choose another seed"  # the script goes by color alone
     exam.judge()
 
 
-def test_after_a_miss_the_pandas_loop_grabs_again(panda):
+def test_after_a_miss_the_pandas_loop_grabs_again(panda_world):
     """Script, scene VLM and physics are the demo's; looks and drives are the simulator's truth."""
     exam, manifest = Exam("panda-scene-vlm"), load_manifest(record_counter.MANIFEST)
-    env = panda.arm
-    panda.reset(900)
+    env = panda_world.arm
+    panda_world.reset(900)
     target = env.target
     skills = [record_counter.missing(random.Random(900), manifest), manifest]
     answers: list[str] = []
@@ -188,7 +188,7 @@ def test_after_a_miss_the_pandas_loop_grabs_again(panda):
                 place = env.ground_truth().objects[target].position_base
                 return Outcome("found", "there", data={"point_base_m": list(place)})
             case ExecuteRskill(rskill_id=manifest.name):
-                grab(panda, skills.pop(0), target)
+                grab(panda_world, skills.pop(0), target)
             case _:
                 record_counter.stand_before(env, target, random.Random(0))
         return Outcome("succeeded", "")

@@ -20,12 +20,6 @@ PATIENCE_S = 60.0
 KEY = "none-is-checked"
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    """The gateway is aiohttp's, and its clients here are asyncio's."""
-    return "asyncio"
-
-
 class GatewayProcess:
     """`vram-gateway serve`, forked where `prepared`. `url`: what it printed."""
 

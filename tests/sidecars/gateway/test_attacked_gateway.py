@@ -12,7 +12,6 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import httpx
@@ -22,6 +21,7 @@ pytest.importorskip("aiohttp", reason="the extra `gateway`")
 
 from tests.sidecars.gateway.conftest import PATIENCE_S, GatewayProcess, stand_in
 from tests.support.process import ArbiterProcess
+from tests.support.processes import rss_bytes
 from tests.support.waiting import until
 
 pytestmark = pytest.mark.e2e
@@ -62,11 +62,11 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GatewayProces
 
 
 @pytest.fixture(autouse=True)
-def honest(
+def asked_meanwhile(
     attacked: GatewayProcess, record_property: Callable[[str, object], None]
 ) -> Iterator[None]:
     """Ask as others do, all the time. The gateway keeps nothing of an attack, and little in it."""
-    before, files = rss_bytes(attacked), open_files(attacked)
+    before, files = rss_bytes(attacked.process.pid), open_files(attacked)
     took_s, grown, stop = [], 0, threading.Event()
     problems: list[str] = []
 
@@ -77,7 +77,7 @@ def honest(
                 began = time.monotonic()
                 answer = client.post("/v1/echo", content=b'{"model": "b"}')
                 took_s.append(time.monotonic() - began)
-                grown = max(grown, rss_bytes(attacked) - before)
+                grown = max(grown, rss_bytes(attacked.process.pid) - before)
                 if answer.status_code != 200:
                     problems.append(answer.text)
 
@@ -92,24 +92,19 @@ def honest(
     record_property("honest_p99_ms", round(sorted(took_s)[int(0.99 * len(took_s))] * 1e3, 1))
     assert not problems
     assert grown <= MEMORY_MAX
-    until(lambda: not busy(attacked))
+    until(lambda: not unanswered(attacked))
     until(lambda: open_files(attacked) <= files + 8)  # kept connections to servers
 
 
-def busy(gateway: GatewayProcess) -> int:
+def unanswered(gateway: GatewayProcess) -> int:
     return sum(one["in_flight"] + one["waiting"] for one in gateway.running().values())
-
-
-def rss_bytes(gateway: GatewayProcess) -> int:
-    pages = Path(f"/proc/{gateway.process.pid}/statm").read_text().split()[1]
-    return int(pages) * os.sysconf("SC_PAGESIZE")
 
 
 def open_files(gateway: GatewayProcess) -> int:
     return len(os.listdir(f"/proc/{gateway.process.pid}/fd"))
 
 
-def connect(gateway: GatewayProcess) -> socket.socket:
+def connection_to(gateway: GatewayProcess) -> socket.socket:
     found = urlsplit(gateway.url)
     return socket.create_connection((found.hostname, found.port), PATIENCE_S)
 
@@ -164,7 +159,7 @@ def test_a_request_that_can_be_read_two_ways_is_refused(
     attacked: GatewayProcess, head: bytes
 ) -> None:
     """What follows it is not taken for another request."""
-    with connect(attacked) as peer:
+    with connection_to(attacked) as peer:
         peer.sendall(head + SMUGGLED)
         peer.settimeout(PATIENCE_S)
         came = answers(peer)
@@ -175,14 +170,14 @@ def test_a_request_that_can_be_read_two_ways_is_refused(
     "head", [b"GET http://localhost/x HTTP/1.1\r\n", b"CONNECT localhost:80 HTTP/1.1\r\n"]
 )
 def test_the_gateway_leads_nowhere_else(attacked: GatewayProcess, head: bytes) -> None:
-    with connect(attacked) as peer:
+    with connection_to(attacked) as peer:
         peer.sendall(head + b"Host: localhost\r\n\r\n")
         assert statuses(peer.recv(1 << 16)) == [400]
 
 
 def test_requests_at_once_are_answered_in_their_order(attacked: GatewayProcess) -> None:
     body = b"GET /x HTTP/1.1\r\n\r\n"
-    with connect(attacked) as peer:
+    with connection_to(attacked) as peer:
         first = ECHO + b"Content-Length: %d\r\n\r\n" % len(body) + body
         second = SMUGGLED.replace(b"\r\n\r\n", b"\r\nConnection: close\r\n\r\n")
         peer.sendall(first + ECHO + b"Transfer-Encoding: chunked\r\n\r\n")
@@ -218,7 +213,7 @@ def test_a_body_whose_model_does_not_come_is_refused(
     def chunk(data: bytes) -> bytes:
         return b"%x\r\n%b\r\n" % (len(data), data)
 
-    with connect(attacked) as peer:
+    with connection_to(attacked) as peer:
         peer.sendall(head + (chunk(begin) if begin else b""))
         with contextlib.suppress(OSError):  # it may hang up meanwhile
             peer.sendall(chunk(more))
@@ -229,7 +224,7 @@ def test_bodies_in_wait_hold_no_more_than_allowed(attacked: GatewayProcess) -> N
     """One that finds no room is told so, and finds it when others have left."""
     body = b'{"a": "' + b"x" * (BODY_MAX - 1000)
     with contextlib.ExitStack() as stack:
-        peers = [stack.enter_context(connect(attacked)) for _ in range(8)]
+        peers = [stack.enter_context(connection_to(attacked)) for _ in range(8)]
         for peer in peers:
             peer.sendall(CHAT + b"Content-Length: %d\r\n\r\n" % BODY_MAX + body)
         told = [peer.recv(1 << 16) for peer in peers]  # the rest: nothing came for HEAD_S
@@ -239,7 +234,7 @@ def test_bodies_in_wait_hold_no_more_than_allowed(attacked: GatewayProcess) -> N
 
 def test_a_silent_body_does_not_keep_its_server(attacked: GatewayProcess) -> None:
     with contextlib.ExitStack() as stack:
-        peers = [stack.enter_context(connect(attacked)) for _ in range(24)]
+        peers = [stack.enter_context(connection_to(attacked)) for _ in range(24)]
         for peer in peers:
             peer.sendall(ECHO + b"Content-Length: 100\r\n\r\nslow")
         until(lambda: attacked.running()["a"]["in_flight"] == 24)  # `parallel`
@@ -249,7 +244,7 @@ def test_a_silent_body_does_not_keep_its_server(attacked: GatewayProcess) -> Non
 
 def test_a_silent_head_is_cut(attacked: GatewayProcess) -> None:
     with contextlib.ExitStack() as stack:
-        peers = [stack.enter_context(connect(attacked)) for _ in range(300)]
+        peers = [stack.enter_context(connection_to(attacked)) for _ in range(300)]
         for number, peer in enumerate(peers):
             peer.sendall(ECHO[: number % len(ECHO)])
         for peer in peers:
@@ -260,7 +255,7 @@ def test_a_silent_head_is_cut(attacked: GatewayProcess) -> None:
 def test_slow_readers_hold_no_more_than_buffers(attacked: GatewayProcess) -> None:
     asks = b"GET /upstream/a/large?bytes=8000000 HTTP/1.1\r\nHost: localhost\r\n\r\n"
     with contextlib.ExitStack() as stack:
-        peers = [stack.enter_context(connect(attacked)) for _ in range(20)]
+        peers = [stack.enter_context(connection_to(attacked)) for _ in range(20)]
         for peer in peers:
             peer.sendall(asks * 50)
         until(lambda: attacked.running()["a"]["in_flight"] == 20)
@@ -278,7 +273,7 @@ def test_clients_that_leave_at_any_time_leave_nothing(
     large = b"GET /upstream/a/large?bytes=8000000 HTTP/1.1\r\nHost: localhost\r\n\r\n"
     parts = (b"", asks[:20], asks[:-20], asks, asks * 3, large, ECHO + b"Expect: 100-continue\r\n"
              b"Content-Length: 9\r\n\r\n")  # fmt: skip
-    peers = [connect(attacked) for _ in parts * 3]
+    peers = [connection_to(attacked) for _ in parts * 3]
     for peer, part in zip(peers, parts * 3, strict=True):
         peer.sendall(part)
     until(lambda: attacked.running()["a"]["in_flight"] >= 12)
@@ -308,7 +303,7 @@ def test_a_flood_of_websockets_holds_no_more_than_buffers(attacked: GatewayProce
     endless = b"\x82\xff" + (1 << 62).to_bytes(8) + bytes(4 + MIB)
     with contextlib.ExitStack() as stack:
         for flood in [frame, frame, frame, endless, b"\x89\x80mask" * 100_000]:
-            peer = stack.enter_context(connect(attacked))
+            peer = stack.enter_context(connection_to(attacked))
             peer.sendall(UPGRADE)
             assert statuses(peer.recv(1000)) == [101]
             peer.settimeout(0.05)
@@ -319,20 +314,20 @@ def test_a_flood_of_websockets_holds_no_more_than_buffers(attacked: GatewayProce
 
 
 def test_a_refused_websocket_says_so(attacked: GatewayProcess) -> None:
-    with connect(attacked) as peer:
+    with connection_to(attacked) as peer:
         peer.sendall(UPGRADE.replace(b"/ws ", b"/x "))
         assert statuses(peer.recv(1 << 16)) == [200]  # the server's own answer
-    with connect(attacked) as peer:
+    with connection_to(attacked) as peer:
         peer.sendall(UPGRADE.replace(b"Version: 13", b"Version: 1"))
         assert statuses(peer.recv(1 << 16)) == [400]
 
 
 def test_no_address_has_more_than_its_connections(attacked: GatewayProcess) -> None:
     with contextlib.ExitStack() as stack:
-        peers = [stack.enter_context(connect(attacked)) for _ in range(590)]
-        with connect(attacked) as one:
+        peers = [stack.enter_context(connection_to(attacked)) for _ in range(590)]
+        with connection_to(attacked) as one:
             one.sendall(SMUGGLED)
             assert statuses(one.recv(1 << 16)) == [200]
-        beyond = [stack.enter_context(connect(attacked)) for _ in range(60)]
+        beyond = [stack.enter_context(connection_to(attacked)) for _ in range(60)]
         assert any(answers(peer) == b"" for peer in beyond)
         assert peers

@@ -22,11 +22,11 @@ from tests.sidecars.gateway.conftest import KEY, PATIENCE_S, GatewayProcess, sta
 from tests.support.collector import Collector
 from tests.support.leases import view_of
 from tests.support.process import ArbiterProcess
-from tests.support.waiting import until
+from tests.support.processes import alive, rss_bytes
+from tests.support.waiting import eventually
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.llm.http import JsonHttp
-from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.runtime.telemetry.names import (
     ATTR_CONSUMER,
     EVENT_FIRST_BYTE,
@@ -55,17 +55,8 @@ async def ask(client: openai.AsyncOpenAI, model: str, **fields: object) -> str:
     return str(answer.choices[0].message.content)
 
 
-def alive(pid: int) -> bool:
-    stat = procfs.read_stat(pid)
-    return stat is not None and stat.alive
-
-
 def pid_of(gateway: GatewayProcess, name: str) -> int:
     return int(gateway.client.get(f"/upstream/{name}/x").json()["pid"])
-
-
-async def eventually(condition: Callable[[], object]) -> None:
-    await asyncio.to_thread(until, condition)
 
 
 # -- a stock client
@@ -435,10 +426,6 @@ async def test_a_slow_reader_does_not_fill_memory(
         async for piece in pieces:
             count += len(piece)
     assert count == 1 << 28
-
-
-def rss_bytes(pid: int) -> int:
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
 
 
 async def test_a_websocket_passes_and_does_not_keep_its_server(shared: GatewayProcess) -> None:

@@ -14,25 +14,16 @@ import aiohttp
 
 from tests.sidecars.gateway.conftest import PATIENCE_S, GatewayProcess, stand_in
 from tests.support.process import ArbiterProcess
-from tests.support.waiting import until
+from tests.support.processes import alive
+from tests.support.waiting import eventually
 from vram_arbiter.clients.sync import Client
-from vram_arbiter.schemas.runtime import procfs
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e, pytest.mark.nightly]
 Start = Callable[..., GatewayProcess]
 
 
-async def eventually(condition: Callable[[], object]) -> None:
-    await asyncio.to_thread(until, condition)
-
-
 def state(gateway: GatewayProcess, name: str) -> str:
     return str(gateway.running().get(name, {}).get("lease", "away"))
-
-
-def alive(pid: int) -> bool:
-    stat = procfs.read_stat(pid)
-    return stat is not None and stat.alive
 
 
 def pid_of(gateway: GatewayProcess, name: str) -> int:

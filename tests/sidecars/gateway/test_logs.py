@@ -7,11 +7,6 @@ from vram_arbiter.sidecars.gateway.logs import BEHIND_MAX_BYTES, LINE_MAX_BYTES,
 pytestmark = pytest.mark.anyio
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    return "asyncio"
-
-
 async def test_a_reader_gets_what_is_printed_from_then_on() -> None:
     log, other = Log("a"), Log("b")
     log.add(b"before")

@@ -9,13 +9,13 @@ from vram_arbiter.sidecars.gateway.program import arguments
 ENDPOINT = "ipc:///run/arbiter.sock"
 
 
-def config(text: str) -> ServerConfig:
+def server_config(text: str) -> ServerConfig:
     return load_gateway(f"servers: {{llm: {{vram: 2GiB, {text}}}}}", "gateway.yaml").servers["llm"]
 
 
 @pytest.mark.parametrize("kind", ["unit", "container"])
 def test_a_unit_or_container_takes_the_place_of_the_command(kind: str) -> None:
-    words = arguments("llm", config(f"{kind}: llm.x, port: 8123"), 8123, ENDPOINT, 7)
+    words = arguments("llm", server_config(f"{kind}: llm.x, port: 8123"), 8123, ENDPOINT, 7)
     assert words[words.index(f"--{kind}") + 1] == "llm.x"
     assert words[words.index("--health") + 1] == "http://127.0.0.1:8123/health"
     assert words[-1] == "--", "no command"
@@ -35,4 +35,4 @@ def test_a_unit_or_container_takes_the_place_of_the_command(kind: str) -> None:
 )
 def test_anything_else_is_refused(text: str, problem: str) -> None:
     with pytest.raises(ConfigError, match=problem):
-        config(text)
+        server_config(text)

@@ -19,7 +19,7 @@ from tests.sidecars.gateway.conftest import KEY, PATIENCE_S, GatewayProcess
 from tests.support.leases import view_of
 from tests.support.process import ArbiterProcess
 from tests.support.tiny_gguf import write_gguf
-from tests.support.waiting import until
+from tests.support.waiting import eventually
 from vram_arbiter.clients.sync import Client
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
@@ -61,7 +61,7 @@ async def test_a_stock_client_talks_with_two_servers_in_room_for_one(
         pid = await _process_of(tmp_path, "a")
         os.kill(pid, signal.SIGSTOP)
         other = asyncio.create_task(_chat(client, "b", 5))
-        await _eventually(lambda: servers.running().get("b", {}).get("lease") == "queued")
+        await eventually(lambda: servers.running().get("b", {}).get("lease") == "queued")
         assert servers.running()["a"]["lease"] == "starting"
         os.kill(pid, signal.SIGCONT)
         assert await asyncio.gather(first, other) == [5, 5]
@@ -72,7 +72,7 @@ async def test_a_stock_client_talks_with_two_servers_in_room_for_one(
         await anext(stream)
         os.kill(pid, signal.SIGSTOP)
         other = asyncio.create_task(_chat(client, "a", 5))
-        await _eventually(lambda: servers.running()["b"]["lease"] == "leaving")
+        await eventually(lambda: servers.running()["b"]["lease"] == "leaving")
         with Client("t", endpoint=servers.arbiter.endpoint) as arbiter:
             assert view_of(arbiter, "b").uses == 1
         os.kill(pid, signal.SIGCONT)
@@ -101,9 +101,5 @@ async def _chat(client: openai.AsyncOpenAI, model: str, words: int) -> int:
 async def _process_of(folder: Path, name: str) -> int:
     """Return the process of a server, which may not have loaded yet."""
     path = folder / f"{name}.gguf.pid"
-    await _eventually(lambda: path.exists() and path.read_text())
+    await eventually(lambda: path.exists() and path.read_text())
     return int(path.read_text())
-
-
-async def _eventually(condition: Callable[[], object]) -> None:
-    await asyncio.to_thread(until, condition)

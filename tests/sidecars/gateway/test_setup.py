@@ -34,13 +34,13 @@ EXEC = "{{ path={0} ; argv[]={1} ; ignore_errors=no ; start_time=[n/a] }}"
 
 
 @pytest.fixture
-def programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def path_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder that is the whole PATH, with `cat` and `echo` of the shell alone."""
     monkeypatch.setenv("PATH", str(tmp_path))
     return tmp_path
 
 
-def program(folder: Path, name: str, text: str) -> None:
+def write_program(folder: Path, name: str, text: str) -> None:
     (folder / name).write_text(f"#!/bin/sh\n{text}")
     (folder / name).chmod(0o755)
 
@@ -57,7 +57,7 @@ def test_listening_ports_are_those_of_both_families(tmp_path: Path) -> None:
     assert setup.listening(tmp_path) == {8000, 11434}
 
 
-def test_units_that_start_a_model_server_are_found_by_their_command(programs: Path) -> None:
+def test_units_that_start_a_model_server_are_found_by_their_command(path_folder: Path) -> None:
     shown = "\n\n".join(
         f"Id={name}\nExecStart={EXEC.format(command.split()[0], command)}\nControlGroup={cgroup}"
         for name, command, cgroup in (
@@ -70,8 +70,8 @@ def test_units_that_start_a_model_server_are_found_by_their_command(programs: Pa
         )
     )
     listed = "ollama.service enabled\nvllm@.service static\nssh.service enabled\n"
-    program(
-        programs, "systemctl",
+    write_program(
+        path_folder, "systemctl",
         f"case $* in *list-unit-files*) echo '{listed}' ;; *) echo '{shown}' ;; esac\n",
     )  # fmt: skip
     found = {one.name: (one.kind, one.where, one.port) for one in setup.units()}
@@ -84,7 +84,7 @@ def test_units_that_start_a_model_server_are_found_by_their_command(programs: Pa
     assert setup.units()[0].cgroup == "/system.slice/ollama.service"
 
 
-def test_containers_are_found_by_image_and_command_with_their_outer_port(programs: Path) -> None:
+def test_containers_are_found_by_image_and_command_with_their_outer_port(path_folder: Path) -> None:
     def told(name: str, image: str, *words: str, outside: str = "") -> dict[str, Any]:
         bound = {"8000/tcp": [{"HostIp": "127.0.0.1", "HostPort": outside}]} if outside else None
         return {
@@ -97,8 +97,8 @@ def test_containers_are_found_by_image_and_command_with_their_outer_port(program
         told("/host", "docker.io/ollama/ollama"),
         told("/web", "nginx", outside="80"),
     ]
-    program(
-        programs, "docker",
+    write_program(
+        path_folder, "docker",
         f"[ $2 = ls ] && echo a b c || echo '{json.dumps(inspected)}'\n",
     )  # fmt: skip
     assert [(one.name, one.kind, one.port) for one in setup.containers()] == [
@@ -107,8 +107,8 @@ def test_containers_are_found_by_image_and_command_with_their_outer_port(program
     ]
 
 
-def test_a_machine_without_systemd_and_engines_has_none(programs: Path) -> None:
-    program(programs, "systemctl", "exit 1\n")
+def test_a_machine_without_systemd_and_engines_has_none(path_folder: Path) -> None:
+    write_program(path_folder, "systemctl", "exit 1\n")
     assert (setup.units(), setup.containers()) == ([], [])
 
 
@@ -129,7 +129,7 @@ ANSWERS: Mapping[str, Mapping[str, str]] = {
 
 
 @pytest.fixture
-def served(request: pytest.FixtureRequest) -> Iterator[int]:
+def answering(request: pytest.FixtureRequest) -> Iterator[int]:
     """The port of a server with these answers."""
     answers: Mapping[str, str] = request.param
 
@@ -151,7 +151,7 @@ def served(request: pytest.FixtureRequest) -> Iterator[int]:
 
 
 @pytest.mark.parametrize(
-    ("served", "kind", "on_evict", "models"),
+    ("answering", "kind", "on_evict", "models"),
     [
         (ANSWERS["vllm"], "vllm", "vllm", ("Qwen/Q",)),
         ({**ANSWERS["vllm"], "/is_sleeping": ""}, "vllm", "stop", ("Qwen/Q",)),
@@ -166,12 +166,12 @@ def served(request: pytest.FixtureRequest) -> Iterator[int]:
         (ANSWERS["comfyui"], "comfyui", "comfyui", ()),
         (ANSWERS[""], "", "stop", ()),
     ],
-    indirect=["served"],
+    indirect=["answering"],
 )
 def test_a_server_is_what_its_endpoints_say(
-    served: int, kind: str, on_evict: str, models: tuple[str, ...]
+    answering: int, kind: str, on_evict: str, models: tuple[str, ...]
 ) -> None:
-    found = setup.asked(FoundServer("", "pid", "", served))
+    found = setup.asked(FoundServer("", "pid", "", answering))
     assert (found.kind, found.on_evict, found.models) == (kind, on_evict, models)
 
 
@@ -244,8 +244,8 @@ def test_with_several_gpus_each_server_names_its_own() -> None:
 
 # -- writing and starting
 @pytest.fixture
-def site(programs: Path) -> Site:
-    home = programs / "config"
+def site(path_folder: Path) -> Site:
+    home = path_folder / "config"
     return replace(site_of_user({"XDG_CONFIG_HOME": str(home), "XDG_RUNTIME_DIR": str(home)}))
 
 
@@ -254,9 +254,9 @@ def text_for(site: Site) -> str:
 
 
 def test_files_are_private_a_unit_is_written_and_nothing_is_overwritten(
-    site: Site, programs: Path, capsys: pytest.CaptureFixture[str]
+    site: Site, path_folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    program(programs, "systemctl", f"echo $* >>{programs}/calls; echo Version=252\n")
+    write_program(path_folder, "systemctl", f"echo $* >>{path_folder}/calls; echo Version=252\n")
     assert setup.install(site, text_for(site), ENDPOINT, force=False) == 0
     path, keys = site.settings / "gateway.yaml", site.settings / "gateway-keys.yaml"
     assert (site.settings / "gateway.env").read_text() == f"VRAM_ARBITER_ENDPOINT={ENDPOINT}\n"
@@ -269,7 +269,7 @@ def test_files_are_private_a_unit_is_written_and_nothing_is_overwritten(
         f"export OPENAI_API_KEY={key.key.get_secret_value()}",
     ]
     assert "vram-gateway serve --config %E" in (site.units / setup.UNIT).read_text()
-    assert (programs / "calls").read_text().splitlines()[1:] == [
+    assert (path_folder / "calls").read_text().splitlines()[1:] == [
         "--user daemon-reload",
         f"--user enable {setup.UNIT}",
         f"--user restart {setup.UNIT}",
@@ -303,18 +303,20 @@ def test_without_a_server_nothing_is_written(site: Site) -> None:
 
 @pytest.mark.e2e
 def test_a_dry_run_prints_the_file_and_changes_nothing(
-    arbiter_daemon: ArbiterProcess, programs: Path, capsys: pytest.CaptureFixture[str]
+    arbiter_daemon: ArbiterProcess, path_folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The GPU is that of the running arbiter; nobody needs a server for that."""
     shown = f"Id=a.service\nExecStart={EXEC.format('/o', '/o/ollama serve')}\nControlGroup=\n"
     answers = f"case $* in *list-unit-files*) echo a.service ;; *) echo '{shown}' ;; esac"
-    program(programs, "systemctl", f"echo $* >>{programs}/calls\n{answers}\n")
+    write_program(path_folder, "systemctl", f"echo $* >>{path_folder}/calls\n{answers}\n")
     assert main(["setup", "--dry-run", "--endpoint", arbiter_daemon.endpoint]) == 0
     said = capsys.readouterr().out
     assert "# GPU: Simulated GPU (8 GiB)" in said
     assert "# a: ollama, port 11434: nothing of it is on a GPU" in said
     assert "servers: {}" in said
-    assert not [line for line in (programs / "calls").read_text().splitlines() if "enable" in line]
+    assert not [
+        line for line in (path_folder / "calls").read_text().splitlines() if "enable" in line
+    ]
 
 
 def test_without_an_arbiter_it_says_how_to_start_it(tmp_path: Path) -> None:
