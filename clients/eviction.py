@@ -132,6 +132,7 @@ class Departure:
             return False
         self._record.stays()
         self.asked, self._left = False, None  # `_leave` ends
+        self.progress.changed()
         return True
 
     async def park(self) -> None:
