@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
@@ -61,7 +60,7 @@ class Rollout(BaseModel):
     n_obs_steps: int | None = Field(
         default=None, ge=1, le=16
     )  # consecutive observations that a chunk needs; None: as many as the sidecar says, else 1
-    adapter: Literal["openpi"] | None = None  # a server of that project; None: a sidecar
+    adapter: str | None = None  # "openpi": a server of that project; any other: a sidecar's
     openpi_observation: dict[str, JsonValue] = Field(default_factory=dict)
     """What openpi's server is shown (`clients.sidecar.openpi.Template`)."""
     targets_lead: bool = (
@@ -157,7 +156,7 @@ def wire_up(
 def _openpi_problems(rollout: Rollout, there: set[str]) -> list[Problem]:
     """Return what an openpi server is to be shown and is not `there`."""
     path = ("policy_extras", "openpi_observation")
-    if rollout.adapter is None:
+    if rollout.adapter != "openpi":
         return []
     try:
         names = Template(rollout.openpi_observation).names
