@@ -3,8 +3,8 @@ signals on, release when it ends.
 
 The lease belongs to `vramctl`, the bytes to its child: a consumer is a process tree, and the
 arbiter charges a child's bytes to its nearest ancestor with a lease. A program that leaves the tree
-(it daemonizes) or leases for itself is not covered. A systemd unit or a container is no child: its
-lease names its cgroup.
+(it daemonizes) or leases for itself is not covered. A systemd unit or a container is not a child:
+its lease names its cgroup.
 
 What happens on an eviction is `clients.foreign`'s; docs/how-to/foreign-programs.md explains it.
 """

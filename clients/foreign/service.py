@@ -130,7 +130,7 @@ class ServiceProgram:
 
 
 async def _call(command: Sequence[str], *, quiet: bool = False) -> int:
-    """Return the exit code of a command. `quiet`: what it prints is no word of the service."""
+    """Return the exit code of a command. `quiet`: what it prints is not the service's."""
     none, out = asyncio.subprocess.DEVNULL, asyncio.subprocess.DEVNULL if quiet else None
     try:
         child = await asyncio.create_subprocess_exec(*command, stdin=none, stdout=out)
@@ -213,18 +213,18 @@ def _check_name(name: str, pattern: str) -> None:
 def _shown(program: Sequence[str], name: str) -> dict[str, str]:
     """Return properties of a unit; none where its manager does not answer."""
     wanted = "--property=Id,LoadState,Slice,ControlGroup,Result,ExecMainStatus"
-    said = _ask(*program, "show", wanted, "--", name)
+    said = said_by(*program, "show", wanted, "--", name)
     return dict(line.split("=", 1) for line in said.splitlines())
 
 
 def _inspected(engine: str, name: str) -> dict[str, Any] | None:
     """Return what an engine tells of a container; None: it knows none of that name."""
-    said = _ask(engine, "container", "inspect", "--", name)
+    said = said_by(engine, "container", "inspect", "--", name)
     found = json.loads(said) if said else []
     return found[0] if found else None
 
 
-def _ask(*command: str) -> str:
+def said_by(*command: str) -> str:
     """Return what a command printed; "" where it failed."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=ASK_S, check=False)
@@ -255,7 +255,7 @@ def _cgroup_of(found: Mapping[str, Any]) -> str:
 def _predicted(engine: str, found: Mapping[str, Any]) -> str:
     """Return the cgroup that a container will have, by its engine's way of naming them."""
     host, identity = found["HostConfig"], found["Id"]
-    manager = host.get("CgroupManager") or _ask(engine, "info", "--format={{.CgroupDriver}}")
+    manager = host.get("CgroupManager") or said_by(engine, "info", "--format={{.CgroupDriver}}")
     rootless = engine == "podman" and os.getuid() != 0
     systemd = ("systemctl", "--user") if rootless else ("systemctl",)
     prefix, parent, folder = {

@@ -205,7 +205,7 @@ def repair(root: Path) -> list[str]:
 def notes(root: Path) -> list[CommittedNote]:
     """Return the notes of the committed episodes, in order, with the operator's marks.
 
-    Raises ConfigError for a line that is no note.
+    Raises ConfigError for a line that is not a note.
     """
     path, record = root / FOLDER / EPISODES, opened(root)
     if not path.exists():

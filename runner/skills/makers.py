@@ -15,14 +15,14 @@ from vram_arbiter.runner.safety.limits import Limits
 from vram_arbiter.runner.skills.ros_standins import TRAJECTORY, StandIn, StandIns
 from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
 from vram_arbiter.runner.skills.trajectory import FollowJointTrajectory
-from vram_arbiter.runner.skills.wiring import Rollout, wire_up
+from vram_arbiter.runner.skills.wiring import OPENPI, Rollout, wire_up
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 
 
 def client_of(rollout: Rollout, endpoint: str, timeout_s: float = CALL_TIMEOUT_S) -> PolicyClient:
     """Return the client of a policy's server. Raises ConfigError for an address that is not one."""
-    if rollout.adapter == "openpi":
+    if rollout.adapter == OPENPI:
         template = Template(rollout.openpi_observation)
         return OpenpiClient(endpoint, template, timeout_s=timeout_s)
     return PolicyClient(endpoint, timeout_s=timeout_s)

@@ -28,6 +28,7 @@ from vram_arbiter.schemas.manifest.manifest import IMAGES_PREFIX
 from vram_arbiter.schemas.sidecar import LEFT_OVER_MAX
 
 STATE, TASK = "observation.state", "task"
+OPENPI = "openpi"  # of `policy_extras.adapter`: a server of that project; any other: a sidecar's
 ROLLOUT_S = 5.0  # of motion, unless the manifest says otherwise
 
 
@@ -60,7 +61,7 @@ class Rollout(BaseModel):
     n_obs_steps: int | None = Field(
         default=None, ge=1, le=16
     )  # consecutive observations that a chunk needs; None: as many as the sidecar says, else 1
-    adapter: str | None = None  # "openpi": a server of that project; any other: a sidecar's
+    adapter: str = ""
     openpi_observation: dict[str, JsonValue] = Field(default_factory=dict)
     """What openpi's server is shown (`clients.sidecar.openpi.Template`)."""
     targets_lead: bool = (
@@ -156,7 +157,7 @@ def wire_up(
 def _openpi_problems(rollout: Rollout, there: set[str]) -> list[Problem]:
     """Return what an openpi server is to be shown and is not `there`."""
     path = ("policy_extras", "openpi_observation")
-    if rollout.adapter != "openpi":
+    if rollout.adapter != OPENPI:
         return []
     try:
         names = Template(rollout.openpi_observation).names

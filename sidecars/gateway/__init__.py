@@ -6,11 +6,12 @@ listens, and runs until SIGTERM. Its parts:
 - `routing`: body → model's name → server; pure.
 - `turns`: which waiting request is next; pure.
 - `keys`: who asks, and for what it may; pure.
-- `program`: one model server under one lease, as a child `vramctl run --control`.
+- `program`: one model server under one lease, by a child `vramctl run --control`.
 - `logs`: what servers print, and its readers.
 - `server`: the states of one server, and the requests that wait for it.
-- `proxy`: bytes both ways, HTTP and WebSocket.
-- `front`: llama-swap's endpoints, limits, errors.
+- `upstream`: connections to servers, and where their answers end; `reply`: what a client gets, with
+  the errors; `proxy`: bytes both ways, HTTP and WebSocket.
+- `front`: llama-swap's endpoints, and limits.
 - `gateway`: all of it joined; `__main__`: the command line.
 - `imports`: llama-swap's configuration → the gateway's; pure, but for its command.
 - `setup`: what runs on this machine → the gateway's configuration and unit.

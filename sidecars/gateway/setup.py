@@ -24,6 +24,7 @@ import yaml
 
 from vram_arbiter.clients.cli.installation.contents import wanted
 from vram_arbiter.clients.cli.installation.site import SYSTEM, Site, site_of_user
+from vram_arbiter.clients.foreign.service import said_by
 from vram_arbiter.clients.net.request import ask
 from vram_arbiter.schemas.config.gateway import load_gateway, load_keys
 from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
@@ -35,7 +36,7 @@ from vram_arbiter.schemas.wire.requests import Status
 
 UNIT: Final = "vram-gateway.service"
 CONFIG, KEYS, ENVIRON = "gateway.yaml", "gateway-keys.yaml", "gateway.env"
-ASK_S, COMMAND_S = 2.0, 20.0
+ASK_S = 2.0
 ANSWER_MAX_BYTES: Final = 1 << 20
 MODELS_MAX: Final = 64
 STEP_BYTES: Final = 64 << 20
@@ -136,11 +137,11 @@ def units() -> list[FoundServer]:
     """Return the services of systemd that start a model server: root's are the machine's, another
     user's its own."""
     control = ("systemctl", *(("--user",) if os.getuid() else ()))
-    listed = _said(*control, "list-unit-files", "--type=service", "--plain", "--no-legend")
+    listed = said_by(*control, "list-unit-files", "--type=service", "--plain", "--no-legend")
     names = [line.split()[0] for line in listed.splitlines() if line.strip() and "@." not in line]
     asked_for = "--property=Id,ExecStart,ControlGroup"
     found = []
-    for block in _said(*control, "show", asked_for, "--", *names).split("\n\n") if names else ():
+    for block in said_by(*control, "show", asked_for, "--", *names).split("\n\n") if names else ():
         facts = dict(line.split("=", 1) for line in block.splitlines() if "=" in line)
         command = " ".join(re.findall(r"argv\[\]=(.*?) ; ", facts.get("ExecStart", "")))
         if kind := kind_of(command):
@@ -154,8 +155,8 @@ def containers() -> list[FoundServer]:
     podman within its limits."""
     found = []
     for engine in filter(shutil.which, ("podman", "docker") if os.getuid() else ("docker",)):
-        listed = _said(engine, "container", "ls", "--all", "--quiet", "--no-trunc").split()
-        said = _said(engine, "container", "inspect", "--", *listed) if listed else ""
+        listed = said_by(engine, "container", "ls", "--all", "--quiet", "--no-trunc").split()
+        said = said_by(engine, "container", "inspect", "--", *listed) if listed else ""
         for one in json.loads(said) if said else ():
             config = one["Config"]
             entry = config.get("Entrypoint") or ()
@@ -249,17 +250,6 @@ def _got(port: int, path: str) -> str:
         connection.close()
 
 
-def _said(*command: str) -> str:
-    """Return what a program printed; "" where it is not there, or failed."""
-    try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, timeout=COMMAND_S, check=False
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return "" if done.returncode else done.stdout
-
-
 # -- the file
 def config_text(found: Found, keys_file: Path) -> str:
     """Return gateway.yaml. A server that cannot be configured is a comment with the reason."""
@@ -275,10 +265,8 @@ def config_text(found: Found, keys_file: Path) -> str:
         name = _free_name(server.name, servers)
         told = f"{name}: {server.kind}, port {server.port}"
         if server.where == "pid":
-            reason = (
-                "is no unit or container that this gateway may start: make it one, or a `command`"
-            )
-            lines.append(f"{told}, {reason} ({server.command})")
+            what = "is neither a unit nor a container that this gateway may start"
+            lines.append(f"{told}, {what}: make it one, or a `command` ({server.command})")
         elif not server.held_bytes:
             lines.append(f"{told}: nothing of it is on a GPU; start it, and run setup again")
         else:
@@ -382,7 +370,7 @@ def _write(path: Path, text: str) -> None:
 def _start(site: Site, path: Path) -> int:
     """Start the service, whose unit is written where `vramctl install` has not."""
     control = ["systemctl", *(() if site.system else ("--user",))]
-    if not _said(*control, "show", "--property=Version"):
+    if not said_by(*control, "show", "--property=Version"):
         print(f"systemd does not run here; start it by: vram-gateway serve --config {path}")
         return 0
     unit = site.units / UNIT

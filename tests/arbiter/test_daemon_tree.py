@@ -180,7 +180,7 @@ def cgroup() -> Iterator[Path]:
 def test_the_bytes_of_a_cgroup_are_those_of_the_lease_that_names_it(
     quick_reader: ArbiterProcess, watcher: WireClient, cgroup: Path
 ) -> None:
-    """The job is no descendant of the holder. Its bytes, there before the lease, are not counted
+    """The job does not descend from the holder. Its bytes, there before the lease, are not counted
     twice; a sibling's stay a stowaway's."""
     root = procfs.cgroup_root()
     assert root is not None

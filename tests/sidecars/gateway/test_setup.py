@@ -220,7 +220,8 @@ def test_the_file_has_what_is_known_and_comments_for_the_rest() -> None:
     comments = [line for line in text.splitlines() if line.startswith("#")]
     assert "# GPU: RTX (8 GiB)" in comments
     assert any(
-        "is no unit or container" in line and "llama-server -m x" in line for line in comments
+        "is neither a unit nor a container" in line and "llama-server -m x" in line
+        for line in comments
     )
     assert any(
         line.startswith("# comfy: ") and "nothing of it is on a GPU" in line for line in comments
@@ -305,7 +306,7 @@ def test_without_a_server_nothing_is_written(site: Site) -> None:
 def test_a_dry_run_prints_the_file_and_changes_nothing(
     arbiter_daemon: ArbiterProcess, path_folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The GPU is that of the running arbiter; nobody needs a server for that."""
+    """The GPU is that of the running arbiter; no server is needed for that."""
     shown = f"Id=a.service\nExecStart={EXEC.format('/o', '/o/ollama serve')}\nControlGroup=\n"
     answers = f"case $* in *list-unit-files*) echo a.service ;; *) echo '{shown}' ;; esac"
     write_program(path_folder, "systemctl", f"echo $* >>{path_folder}/calls\n{answers}\n")

@@ -29,8 +29,10 @@ def test_an_overlapping_cgroup_of_another_process_is_refused(
 
 
 def test_cgroups_beside_each_other_are_two_processes_matter(driver: CoreDriver) -> None:
-    for number, cgroup in enumerate((UNIT, f"{UNIT}2", "/system.slice/llm")):
+    named = (UNIT, f"{UNIT}2", "/system.slice/llm")
+    for number, cgroup in enumerate(named):
         driver.consumer(f"c{number}").acquire(GIB, cgroup=cgroup)
+    assert driver.arbiter.claims(GPU_0).keys() == set(named)
 
 
 def test_a_cgroup_is_free_again_when_its_lease_is_over(driver: CoreDriver) -> None:
@@ -39,7 +41,9 @@ def test_a_cgroup_is_free_again_when_its_lease_is_over(driver: CoreDriver) -> No
     give_back(driver, llm, lease)
     killed, _ = held(driver, "killed", 2, cgroup=UNIT)
     killed.die()
-    driver.consumer("next").acquire(GIB, cgroup=UNIT)
+    successor = driver.consumer("next")
+    successor.acquire(GIB, cgroup=UNIT)
+    assert driver.arbiter.claims(GPU_0) == {UNIT: (successor.process, "next")}
 
 
 def test_a_cgroup_is_a_waiters_and_a_lease_s_that_is_away_too() -> None:
