@@ -17,6 +17,7 @@ _PACKAGES = {
     "dataset": "datasets pyarrow pandas av",
     "ros2": "cyclonedds rosbags",
     "viz": "rerun",
+    "top": "textual rich",
     "mcp": "mcp",
     "doors": "grpc google",
     "gateway": "aiohttp",

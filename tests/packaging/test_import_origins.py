@@ -35,7 +35,7 @@ BASE_MODULES = [
     for package in ("arbiter", "clients", "schemas")
     for path in sorted((TREE / package).rglob("*.py"))
     if path.name not in ("__init__.py", "__main__.py")
-    if "observer" not in path.relative_to(TREE).parts[:2]  # its program needs an extra
+    if {"observer", "top"}.isdisjoint(path.parts)  # these need an extra
 ]
 
 

@@ -5,7 +5,6 @@ An escape sequence in a consumer name could clear the screen, rename the window 
 does not exist; a line break in a reason forged lines of the log.
 """
 
-import io
 import json
 import logging
 import unicodedata
@@ -16,8 +15,6 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
-from rich.text import Text
 
 from tests.clients.cli import test_text as said
 from vram_arbiter.arbiter import log as telemetry
@@ -141,14 +138,6 @@ def test_the_demos_lines_obey_no_escapes(capsys: pytest.CaptureFixture[str]) -> 
     assert not obeyed(shown)
     assert shown.count("[red]line[/red]") == 3
     assert shown.count("\n") == 2
-
-
-def test_a_status_has_no_markup() -> None:
-    console = Console(file=io.StringIO(), width=200)
-    console.print(Text("\n".join(text.status_lines(poisoned(STATUS, HOSTILE)))))
-    shown = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO
-    assert "[red]line[/red]" in shown
-    assert not obeyed(shown)
 
 
 # -- logs and errors

@@ -18,6 +18,8 @@ from pathlib import Path
 
 import anyio
 import pytest
+
+pytest.importorskip("textual", reason="the extra `top`")
 from rich.cells import cell_len
 from textual.pilot import Pilot
 from textual.widgets import Static
