@@ -28,7 +28,7 @@ BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help setup setup-core setup-worlds jetson demo test test-core test-gpu nightly mutation measure lint format \
-	chaos sim bench bench-gateway bench-switch schemas docs clean
+	chaos sim bench bench-doors bench-gateway bench-switch schemas docs clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -95,6 +95,9 @@ bench-switch: setup ## how fast a model of 500 MB is loaded, restored and evicte
 
 bench-gateway: setup ## what the gateway adds, and two servers in room for one: MINUTES=10
 	$(TOOL) tests/bench/gateway.py --minutes $(MINUTES) $(ARGS)
+
+bench-doors: setup ## how long robots at a sidecar's doors wait while one process attacks
+	$(TOOL) tests/bench/doors.py $(if $(QUICK),--quick) $(ARGS)
 
 schemas: setup ## write the JSON Schemas after a model changed
 	$(BIN)/python -m vram_arbiter.schemas export schemas/json

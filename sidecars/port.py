@@ -23,6 +23,9 @@ from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.trust import ROOT, port_uids
 
 CONNECTIONS_MAX = 64
+ACCEPT_PAUSE_S: Final = 0.01
+"""After each connection: those that come faster wait in the kernel, and cost the event loop
+nothing."""
 READ_BYTES = 256 * 1024
 FREE_BYTES: Final = 4 * MIB
 """Unproven bytes of one connection that are read at once, an observation of four small cameras; or
@@ -110,13 +113,8 @@ async def on_port(
     passing: set[asyncio.Task[None]] = set()
     looking = asyncio.Lock()  # one at a time: refused users must not cost the event loop its time
 
-    async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None, "a stream's callback is a task"
-        if len(passing) >= connections_max:
-            writer.close()
-            return
-        passing.add(task)
+    async def connected(client: socket.socket) -> None:
+        reader, writer = await asyncio.open_connection(sock=client)
         try:
             if conduct is not None:
                 await asyncio.sleep(conduct.debt_s())
@@ -126,26 +124,41 @@ async def on_port(
                 await _pass_on(reader, writer, path, conduct)
         except OSError as error:
             _log.warning("a connection to port %d ended: %s", port, error)
-        except asyncio.CancelledError:
-            pass  # the port ends; asyncio's streams take a canceled callback for a defect
         finally:
-            passing.discard(task)
             writer.close()
 
+    async def accept() -> None:
+        while True:
+            try:
+                client, _ = await asyncio.get_running_loop().sock_accept(listening)
+            except OSError as error:  # it hung up, or there are too many open files
+                _log.warning("a connection to port %d was not taken: %s", port, error)
+            else:
+                if len(passing) < connections_max:
+                    task = asyncio.create_task(connected(client))
+                    passing.add(task)
+                    task.add_done_callback(passing.discard)
+                else:
+                    client.close()
+            await asyncio.sleep(ACCEPT_PAUSE_S)
+
     try:
-        server = await asyncio.start_server(connected, "127.0.0.1", port)
+        listening = socket.create_server(("127.0.0.1", port), backlog=connections_max)
     except OSError as error:
         raise ConfigError(
             f"port {port} of 127.0.0.1 cannot be served: {os.strerror(error.errno or 0)}",
             hint="choose another --port, or end the program that listens there",
         ) from error
-    try:
-        yield
-    finally:
-        server.close()
-        for task in passing:
-            task.cancel()
-        await asyncio.gather(*passing, return_exceptions=True)
+    with listening:
+        listening.setblocking(False)
+        accepting = asyncio.create_task(accept())
+        try:
+            yield
+        finally:
+            ending = [accepting, *passing]
+            for task in ending:
+                task.cancel()
+            await asyncio.gather(*ending, return_exceptions=True)
 
 
 async def _pass_on(

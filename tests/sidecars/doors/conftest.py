@@ -83,8 +83,8 @@ class Served:
         assert self.process.wait(PATIENCE_S) == 0, self.log.read_text()
 
 
-@pytest.fixture(scope="session")
-def doors() -> Iterator[dict[str, Served]]:
+@contextmanager
+def serving() -> Iterator[dict[str, Served]]:
     """Two sidecars of one policy: `lerobot`, at whose door robots may choose `openpi` too."""
     arbiter = ArbiterProcess(prepared=True).start()
     keys = arbiter.runtime / "keys"
@@ -103,6 +103,12 @@ def doors() -> Iterator[dict[str, Served]]:
         for one in served.values():
             one.process.kill()
         arbiter.close()
+
+
+@pytest.fixture(scope="session")
+def doors() -> Iterator[dict[str, Served]]:
+    with serving() as served:
+        yield served
 
 
 @pytest.fixture
