@@ -77,9 +77,16 @@ class Server:
     """`async with server.turn(asker) as turn: …` for each request."""
 
     def __init__(
-        self, name: str, config: ServerConfig, client: AsyncClient, reserved: Mapping[str, int]
+        self,
+        name: str,
+        config: ServerConfig,
+        client: AsyncClient,
+        reserved: Mapping[str, int],
+        moved: asyncio.Event,
     ) -> None:
+        """`moved`: set after each change."""
         self.name, self.config, self.log = name, config, Log(name)
+        self._moved = moved
         self.switches = 0
         """How often its program was started or woken."""
         self._client = client
@@ -232,6 +239,7 @@ class Server:
 
     def _advance(self) -> None:
         """Do what is due after any change."""
+        self._moved.set()
         program, now = self._program, self._now()
         if self._closed:
             return

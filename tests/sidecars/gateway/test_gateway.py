@@ -36,6 +36,8 @@ from vram_arbiter.schemas.runtime.telemetry.names import (
     METRIC_GATEWAY_WAITING,
     SPAN_GATEWAY_REQUEST,
 )
+from vram_arbiter.schemas.wire.views import DemandView
+from vram_arbiter.sidecars.gateway.gateway import NAME
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 Start = Callable[..., GatewayProcess]
@@ -186,12 +188,16 @@ async def test_a_client_that_leaves_cancels_its_request_and_gives_up_its_place(
         await eventually(lambda: shared.running().get("a", {}).get("in_flight") == 1)
         second = asyncio.create_task(ask(client, "b"))
         await eventually(lambda: shared.running().get("b", {}).get("lease") == "queued")
-        second.cancel()
-        await eventually(lambda: "b" not in shared.running())
         with Client("t", endpoint=shared.arbiter.endpoint) as arbiter:
+            a, b = (DemandView(name, *of, NAME) for name, of in (("a", (1, 0)), ("b", (0, 1))))
+            await eventually(lambda: arbiter.status().demands == (a, b))
+            second.cancel()
+            await eventually(lambda: "b" not in shared.running())
             await eventually(lambda: [lease.consumer for lease in arbiter.status().leases] == ["a"])
-        first.cancel()
-        await eventually(lambda: shared.running()["a"]["in_flight"] == 0)
+            await eventually(lambda: arbiter.status().demands == (a,))
+            first.cancel()
+            await eventually(lambda: shared.running()["a"]["in_flight"] == 0)
+            await eventually(lambda: arbiter.status().demands == ())
 
 
 async def test_a_request_that_does_not_end_is_ended_after_the_grace(
