@@ -344,9 +344,8 @@ class SessionTable:
 
     def _demand(self, session: Session, request: w.Demand) -> None:
         others = [other.peer for other, _ in self._demands() if other is not session]
-        what, hint = "consumers have requests told", "tell those with the most requests alone"
-        wanted, most = len(request.consumers), DEMANDS_MAX
-        self._check_shares(session.peer, others, wanted, most, "demands_max", what, hint)
+        wanted, hint = len(request.consumers), "tell of those with the most requests alone"
+        self._check_shares(session.peer, others, wanted, "demands_max", DEMANDS_MAX, hint)
         session.demands = tuple(
             DemandView(one.consumer, one.in_flight, one.waiting, session.name)
             for one in request.consumers
@@ -356,20 +355,12 @@ class SessionTable:
         subscribers, most = self._registry.subscribers, self._settings.subscribers_max
         if session.client not in subscribers:
             others = [other.peer for other in subscribers.values()]
-            what = "connections are subscribed"
             hint = "poll history instead, or raise limits.subscribers_max"
-            self._check_shares(session.peer, others, 1, most, "subscribers_max", what, hint)
+            self._check_shares(session.peer, others, 1, "subscribers_max", most, hint)
         subscribers[session.client] = session
 
     def _check_shares(
-        self,
-        peer: Peer,
-        others: Sequence[Peer],
-        wanted: int,
-        most: int,
-        limit: str,
-        what: str,
-        hint: str,
+        self, peer: Peer, others: Sequence[Peer], wanted: int, limit: str, most: int, hint: str
     ) -> None:
         """Raise LimitExceeded where `wanted` places are not left of `most`, or of the share of the
         peer's user or process. `others`: the peer that has it, for each place that is taken."""
@@ -383,8 +374,7 @@ class SessionTable:
         ):
             if count + wanted > allowed:
                 raise LimitExceeded(
-                    f"{count} {what}, {wanted} more were asked for, the limit is {allowed} "
-                    f"({name})",
+                    f"{limit}: {count} places are taken, the limit is {allowed} ({name})",
                     hint=hint,
                     details={"limit": name, "value": allowed},
                 )

@@ -6,7 +6,7 @@ import logging
 import resource
 import signal
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from heapq import nlargest
 from pathlib import Path
 from typing import Any, Final
@@ -121,9 +121,12 @@ def _allow_files() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
-async def _tell(client: AsyncClient, servers: Iterable[Server], moved: asyncio.Event) -> None:
-    """Tell the arbiter how many requests are in flight and wait, once `moved`."""
+async def _tell(client: AsyncClient, servers: Collection[Server]) -> None:
+    """Tell the arbiter how many requests are in flight and wait, after changes."""
     told: Mapping[str, tuple[int, int]] = {}
+    moved = asyncio.Event()
+    for server in servers:
+        server.on_change = moved.set
     while True:
         await moved.wait()
         moved.clear()
@@ -150,9 +153,8 @@ async def run(config: GatewayConfig, endpoint: str | None) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     async with AsyncClient(NAME, endpoint=endpoint) as client:
-        moved = asyncio.Event()
         servers = {
-            name: Server(name, server, client, keys.reserved(name), moved)
+            name: Server(name, server, client, keys.reserved(name))
             for name, server in config.servers.items()
         }
         wanted = http_address(config.listen)
@@ -169,8 +171,8 @@ async def run(config: GatewayConfig, endpoint: str | None) -> None:
         port = listening.sockets[0].getsockname()[1]
         gc.freeze()  # modules stay: no collection, which delays all requests, looks at them again
         print(f"http://{HttpAddress(wanted.host, port)}", flush=True)
+        telling = asyncio.create_task(_tell(client, servers.values()))
         await asyncio.gather(*(server.adopt() for server in servers.values()))
-        telling = asyncio.create_task(_tell(client, servers.values(), moved))
         try:
             await stop.wait()
         finally:

@@ -77,16 +77,10 @@ class Server:
     """`async with server.turn(asker) as turn: …` for each request."""
 
     def __init__(
-        self,
-        name: str,
-        config: ServerConfig,
-        client: AsyncClient,
-        reserved: Mapping[str, int],
-        moved: asyncio.Event,
+        self, name: str, config: ServerConfig, client: AsyncClient, reserved: Mapping[str, int]
     ) -> None:
-        """`moved`: set after each change."""
         self.name, self.config, self.log = name, config, Log(name)
-        self._moved = moved
+        self.on_change: Callable[[], None] = lambda: None
         self.switches = 0
         """How often its program was started or woken."""
         self._client = client
@@ -239,7 +233,7 @@ class Server:
 
     def _advance(self) -> None:
         """Do what is due after any change."""
-        self._moved.set()
+        self.on_change()
         program, now = self._program, self._now()
         if self._closed:
             return
@@ -261,7 +255,7 @@ class Server:
                     begins.set_result(program)
             if not self.in_flight and not self.waiting and self.config.idle_s is not None:
                 self._after("idle", self.config.idle_s, self._idle)
-        elif program.state in ASLEEP and self.waiting:
+        elif self.waiting and (program.state in ASLEEP or not program.granted):
             program.want()
         elif program.state == "queued" and not (self.waiting or program.granted or self._adopted):
             program.end()  # give up its place: no request waits

@@ -69,9 +69,8 @@ def main() -> int:
         suite.write(options.out)
         print(f"{suite.table()}\n{summed(row.ok for row in suite.rows)}; rows are in {options.out}")
     if runner_rows:
-        print(
-            f"\n{bench_runner.table(runner_rows)}\n{summed(row.ok for row in runner_rows)}; rows are in {runner_out}"
-        )
+        targets = summed(row.ok for row in runner_rows)
+        print(f"\n{bench_runner.table(runner_rows)}\n{targets}; rows are in {runner_out}")
     return 0
 
 
