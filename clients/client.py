@@ -12,7 +12,7 @@ robots.
 """
 
 import os
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import replace
 from types import TracebackType
@@ -246,6 +246,14 @@ class AsyncClient:
         """Tell a consumer that its model is wanted soon; it may read its weights into host RAM.
         Nothing is granted, and nothing evicted, for a hint."""
         return await self.ask(w.Prepare(consumer))
+
+    async def demand(self, requests: Mapping[str, tuple[int, int]]) -> None:
+        """Tell the arbiter of the consumers that this client serves, for `status`: how many
+        requests are in flight at each, and how many wait for it. It replaces what was told before,
+        and lasts until the client ends. Raises LimitExceeded."""
+        told = tuple(w.ConsumerDemand(name, *counts) for name, counts in requests.items())
+        session = self._session
+        await session.reply(session.protocol.demand(w.Demand(told), session.now()))
 
     def on_prepare(self, hinted: Callable[[str], object]) -> None:
         """Call `hinted` with the name of a client that says that this consumer's model is wanted

@@ -399,6 +399,7 @@ class Client(_Blocking[AsyncClient]):
     why = _blocking(AsyncClient.why)
     history = _blocking(AsyncClient.history)
     prepare = _blocking(AsyncClient.prepare)
+    demand = _blocking(AsyncClient.demand)
 
     def on_prepare(self, hinted: Callable[[str], object]) -> None:
         """Call `hinted`, on the client's own thread, when this consumer's model is wanted soon."""

@@ -53,6 +53,7 @@ SESSIONS_MAX = 1024
 OPERATOR_RESERVE = 16  # sessions that only operators get
 WAITERS_MAX = 16_384
 LEASES_PER_CLIENT_MAX = 64
+DEMANDS_MAX = 256  # consumers whose requests a status counts: 300 kB at most, 30 kB as a rule
 USES_PER_LEASE_MAX = 256
 PROCESS_SHARE = 1 / 8  # of the places of a limit that all share: the most that one process may take
 USER_SHARE = 3 / 4  # the most that the processes of one user may take together

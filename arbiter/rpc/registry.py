@@ -20,6 +20,7 @@ from vram_arbiter.schemas.runtime.peercred import Peer
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import StatusReply
+from vram_arbiter.schemas.wire.views import DemandView
 
 SILENT_S = 10.0
 """At a limit of sessions a connection that never held anything and has been silent for so long
@@ -121,6 +122,8 @@ class Session:
     without a `bye`."""
     lost: bool = False
     """Its connection is gone; the client may come back on another one."""
+    demands: tuple[DemandView, ...] = ()
+    """What it told of requests at consumers that it serves."""
 
 
 @dataclass(slots=True)
@@ -290,6 +293,7 @@ class Registry:
         """
         if (session := self.sessions.get(client)) is not None:
             session.lost = True
+            session.demands = ()
             self.subscribers.pop(client, None)
             self._end_if_forgotten(session)
 

@@ -24,7 +24,7 @@ from vram_arbiter.arbiter.rpc.registry import (
     Watch,
     share_of,
 )
-from vram_arbiter.schemas.defaults import KIB, WIRE_VERSION
+from vram_arbiter.schemas.defaults import DEMANDS_MAX, KIB, WIRE_VERSION
 from vram_arbiter.schemas.errors import (
     BadRequest,
     BadState,
@@ -37,6 +37,7 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.ids import ClientId, ProcessKey, RequestId
 from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.runtime.peercred import Peer
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.errors import ErrorView
@@ -51,7 +52,7 @@ from vram_arbiter.schemas.wire.replies import (
     WelcomeReply,
 )
 from vram_arbiter.schemas.wire.spec import LeaseSpec
-from vram_arbiter.schemas.wire.views import DaemonView
+from vram_arbiter.schemas.wire.views import DaemonView, DemandView
 
 HISTORY_PAGE = 2000
 """Events in one reply, whatever was asked for: packing more would hold the loop for too long."""
@@ -180,7 +181,7 @@ class SessionTable:
                 if spec.cgroup is not None:
                     known = self._settings.cgroup_root, self._settings.operators_gid
                     check_cgroup(session.peer, spec.cgroup, *known)
-            if isinstance(request, (w.Question, w.Prepare)):  # 5
+            if isinstance(request, w.SessionRequest):  # 5
                 self._answer(session, request_id, request)
                 return True
             if not session.leased and isinstance(request, _HOLDING):
@@ -319,6 +320,9 @@ class SessionTable:
                 for other in told:
                     self.push(other.client, PreparePush(session.name))
                 self.reply(client, re, PrepareReply(len(told)))
+            case w.Demand():
+                self._demand(session, request)
+                self.reply(client, re, DoneReply())
             case w.Bye():
                 self.reply(client, re, DoneReply())
                 self._registry.leave(session, ev.BYE)
@@ -331,27 +335,49 @@ class SessionTable:
         request: w.Status,
     ) -> None:
         status = self._decisions.status(reader, request.after, details=request.details)
-        problems = tuple(self._problems())
-        self.reply(client, re, replace(status, problems=problems, daemon=self._daemon()))
+        demands = () if request.after else tuple(view for _, view in self._demands())
+        problems, daemon = tuple(self._problems()), self._daemon()
+        self.reply(client, re, replace(status, problems=problems, daemon=daemon, demands=demands))
+
+    def _demands(self) -> Iterable[tuple[Session, DemandView]]:
+        return ((one, view) for one in self._sessions.values() for view in one.demands)
+
+    def _demand(self, session: Session, request: w.Demand) -> None:
+        others = [other.peer for other, _ in self._demands() if other is not session]
+        wanted, hint = len(request.consumers), "tell of those with the most requests alone"
+        self._check_shares(session.peer, others, wanted, "demands_max", DEMANDS_MAX, hint)
+        session.demands = tuple(
+            DemandView(one.consumer, one.in_flight, one.waiting, session.name)
+            for one in request.consumers
+        )
 
     def _subscribe(self, session: Session) -> None:
-        subscribers, settings, peer = self._registry.subscribers, self._settings, session.peer
+        subscribers, most = self._registry.subscribers, self._settings.subscribers_max
         if session.client not in subscribers:
-            others, most = [other.peer for other in subscribers.values()], settings.subscribers_max
-            of_user = sum(other.uid == peer.uid for other in others)
-            of_process = sum(other.process == peer.process for other in others)
-            for count, allowed, limit in (
-                (len(others), most, "subscribers_max"),
-                (of_user, share_of(most, settings.user_share), "user_share"),
-                (of_process, share_of(most, settings.process_share), "process_share"),
-            ):
-                if count >= allowed:
-                    raise LimitExceeded(
-                        f"{count} connections are subscribed, the limit is {allowed} ({limit})",
-                        hint="poll history instead, or raise limits.subscribers_max",
-                        details={"limit": limit, "value": allowed},
-                    )
+            others = [other.peer for other in subscribers.values()]
+            hint = "poll history instead, or raise limits.subscribers_max"
+            self._check_shares(session.peer, others, 1, "subscribers_max", most, hint)
         subscribers[session.client] = session
+
+    def _check_shares(
+        self, peer: Peer, others: Sequence[Peer], wanted: int, limit: str, most: int, hint: str
+    ) -> None:
+        """Raise LimitExceeded where `wanted` places are not left of `most`, or of the share of the
+        peer's user or process. `others`: the peer that has it, for each place that is taken."""
+        settings = self._settings
+        of_user = sum(other.uid == peer.uid for other in others)
+        of_process = sum(other.process == peer.process for other in others)
+        for count, allowed, name in (
+            (len(others), most, limit),
+            (of_user, share_of(most, settings.user_share), "user_share"),
+            (of_process, share_of(most, settings.process_share), "process_share"),
+        ):
+            if count + wanted > allowed:
+                raise LimitExceeded(
+                    f"{limit}: {count} places are taken, the limit is {allowed} ({name})",
+                    hint=hint,
+                    details={"limit": name, "value": allowed},
+                )
 
 
 def _check_role(session: Session, request: w.AnyRequest) -> str:

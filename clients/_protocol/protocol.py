@@ -40,6 +40,12 @@ class ClientProtocol:
         self.waits = Waits(self.connection, self.holdings)
         self.foreign_uses = ForeignUses(self.connection)
         self._subscribed = False
+        self._demand: w.Demand | None = None
+
+    def demand(self, told: w.Demand, now: float) -> int:
+        """Tell it now, and after reconnects."""
+        self._demand = told
+        return self.connection.ask(told, now)
 
     def subscribe(self, now: float) -> int:
         """History events from now on, also after reconnects."""
@@ -80,6 +86,8 @@ class ClientProtocol:
     def say_again(self, now: float) -> None:
         if self._subscribed:
             self.connection.ask(w.Subscribe(), now, quiet=True)
+        if self._demand is not None:
+            self.connection.ask(self._demand, now, quiet=True)
         self.waits.say_again(now)
         self.holdings.say_again(now)
         self.foreign_uses.say_again(now)

@@ -335,6 +335,8 @@ async def run_leased(spec: RunSpec, endpoint: str | None) -> int:
             check_gpus(spec.gpu, status.gpus)
         supervisor = Supervisor(spec, client, program)
         await supervisor.acquire()
+        if not await supervisor.still_wanted():
+            return 0
         with Forwarding(supervisor.asked_to_end) as signals:
             try:
                 await supervisor.start(signals)

@@ -26,7 +26,7 @@ _COLUMNS = (
     "PID",
     "SINCE",
 )
-_RIGHT = frozenset({"CHARGE", "DRIFT", "USES", "PRIO", "PID", "SINCE"})
+_RIGHT = frozenset({"CHARGE", "DRIFT", "USES", "PRIO", "PID", "SINCE", "IN FLIGHT", "WAITING"})
 _NOT_SHOWN = frozenset(
     (
         *("seq", "at_wall_s", "kind", "lease_id", "consumer", "reason", "gpu", "token"),
@@ -68,9 +68,11 @@ def status_lines(status: JsonMap) -> list[str]:
     lines += [f"  {problem}" for problem in status.get("problems", ())]
     for gpu in status["gpus"]:
         lines += ["", *_gpu_lines(gpu)]
+    demands = demand_lines(status.get("demands", ()))
+    demands = ["", *demands] if demands else []
     lines.append("")
     if not status["leases"]:
-        return [*lines, "no leases"]
+        return [*lines, "no leases", *demands]
     indices = {gpu["gpu"]: str(gpu["index"]) for gpu in status["gpus"]}
     rows = [_lease_row(lease, indices) for lease in status["leases"]]
     drift = _COLUMNS.index("DRIFT")
@@ -79,9 +81,18 @@ def status_lines(status: JsonMap) -> list[str]:
         drift: not any(row[drift] for row in rows),
     }
     shown = [at for at in range(len(_COLUMNS)) if not hidden.get(at)]
-    return lines + table(
-        [_COLUMNS[at] for at in shown], [[row[at] for at in shown] for row in rows]
-    )
+    leases = table([_COLUMNS[at] for at in shown], [[row[at] for at in shown] for row in rows])
+    return [*lines, *leases, *demands]
+
+
+def demand_lines(demands: Sequence[JsonMap]) -> list[str]:
+    """Return a table of requests at consumers; empty: no client told of any."""
+    columns = ("REQUESTS OF", "IN FLIGHT", "WAITING", "TOLD BY")
+    rows = [
+        (one["consumer"], str(one["in_flight"]), str(one["waiting"]), one["client"])
+        for one in demands
+    ]
+    return table(columns, rows) if rows else []
 
 
 def _gpu_lines(gpu: JsonMap) -> list[str]:

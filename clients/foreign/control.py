@@ -3,7 +3,8 @@
 
 Lines of JSON. To the other program, at each change: `{"state", "lease_id", "token", "gpu",
 "reason"}`, where `state` is `queued` or one of `clients.lease.LeaseState`. From it: `"want"` (come
-back) and `"rest"` (leave, until wanted). The program ends with the other one.
+back; of a service also: start, where it does not run) and `"rest"` (leave, until wanted). The
+program ends with the other one.
 """
 
 import asyncio

@@ -82,6 +82,20 @@ class Supervisor:
             self._spawn(self._obey(self._spec.control))
         self._lease = await self._acquire(self._spec.wait_timeout_s)
 
+    async def still_wanted(self) -> bool:
+        """Return whether to start the program. A service that another program controls, and does
+        not want, is only adopted: where it has ended, its lease is released."""
+        service, control = self._spec.service, self._spec.control
+        if service is None or control is None:
+            return True
+        place, _ = await _in_thread(service.look)
+        if place or control.wanted.is_set():
+            return True
+        say(f"{service.name} has ended, and is not wanted")
+        await self.lease.release(exiting=True)
+        self._tell("gone", self.lease)
+        return False
+
     async def start(self, signals: Forwards) -> None:
         """Start the program. Raises OSError, and what its record raises, with the lease
         released."""
@@ -286,6 +300,8 @@ class Supervisor:
             holding.cancel()
         if state == "gone":
             await lease.wait_gone()
+        if self._spec.control is not None:
+            self._spec.control.wanted.clear()
         self._tell(state, lease)
 
     async def _hold(self, lease: AsyncLease) -> None:
@@ -325,7 +341,6 @@ class Supervisor:
         asked = evicted is not None and evicted.cause == "operator"
         if (control := self._spec.control) is not None:
             await control.wanted.wait()
-            control.wanted.clear()
             asked = True
         if lease.state == "parked" and asked:  # it would not return by itself
             self._tell("queued")

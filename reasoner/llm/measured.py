@@ -44,9 +44,9 @@ class Tally:
 def measured(provider: str, config: LlmConfig, tally: Tally) -> Iterator[Callable[[Answer], None]]:
     """Measure one request, whatever becomes of it. Yields what its answer is told to."""
     labels = {
-        names.ATTR_CHAT_OPERATION: "chat",
-        names.ATTR_PROVIDER: provider,
-        names.ATTR_REQUEST_MODEL: config.model,
+        telemetry.ATTR_CHAT_OPERATION: "chat",
+        telemetry.ATTR_PROVIDER: provider,
+        telemetry.ATTR_REQUEST_MODEL: config.model,
     }
     address = urlsplit(config.base_url)
     attributes: dict[str, str | int] = {

@@ -1,10 +1,9 @@
 """OpenTelemetry's names for requests to language models: one span `chat MODEL` a request."""
 
-from vram_arbiter.schemas.runtime.telemetry.names import metric
+from vram_arbiter.schemas.runtime.telemetry.names import CHATS_S, metric
 
-CHATS_S = tuple(0.01 * 2**n for n in range(14))
-"""Bounds that OpenTelemetry's conventions give for requests to language models, as these tokens."""
 TOKENS = tuple(4.0**n for n in range(14))
+"""Bounds that OpenTelemetry's conventions give."""
 
 GEN_AI_TOKENS = metric(
     "gen_ai.client.token.usage", "{token}", "Tokens of a request to a language model", TOKENS
@@ -12,9 +11,6 @@ GEN_AI_TOKENS = metric(
 GEN_AI_DURATION = metric(
     "gen_ai.client.operation.duration", "s", "One request to a language model, all tries", CHATS_S
 )
-ATTR_CHAT_OPERATION = "gen_ai.operation.name"
-ATTR_PROVIDER = "gen_ai.provider.name"
-ATTR_REQUEST_MODEL = "gen_ai.request.model"
 ATTR_REQUEST_MAX_TOKENS = "gen_ai.request.max_tokens"  # spans only, as all below but two
 ATTR_RESPONSE_MODEL = "gen_ai.response.model"
 ATTR_FINISH_REASONS = "gen_ai.response.finish_reasons"

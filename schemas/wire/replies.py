@@ -8,7 +8,14 @@ from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.wire.errors import ErrorView
 from vram_arbiter.schemas.wire.explained import LeaseDetail
 from vram_arbiter.schemas.wire.tagged import AnyReply as AnyReply
-from vram_arbiter.schemas.wire.views import DaemonView, GpuView, HostRamView, LeaseView, Totals
+from vram_arbiter.schemas.wire.views import (
+    DaemonView,
+    DemandView,
+    GpuView,
+    HostRamView,
+    LeaseView,
+    Totals,
+)
 
 
 class DoneReply(AnyReply):
@@ -110,6 +117,7 @@ class StatusReply(AnyReply):
     next: tuple[int, float, int] | None = None  # there may be more: ask again with this as `after`
     details: tuple[LeaseDetail, ...] = ()  # of each lease of the page, where they are asked for
     daemon: DaemonView | None = None
+    demands: tuple[DemandView, ...] = ()  # on the first page
 
 
 class HistoryReply(AnyReply):

@@ -28,6 +28,7 @@ UseName = Annotated[UseId, NAME]
 TokenPair = Annotated[Token, AsPair()]
 """`[epoch, serial]`."""
 Serial = Annotated[int, Limits(ge=0, lt=1 << 63)]
+Count = Annotated[int, Limits(ge=0, lt=1 << 31)]
 Reason = Annotated[str, Limits(max_length=d.REASON_MAX_CHARS, pattern=r"^[^\x00-\x1f\x7f]*$")]
 Role = Literal["client", "observer", "operator"]
 UseNames = Annotated[tuple[UseName, ...], Limits(max_length=d.USES_PER_LEASE_MAX, fail_fast=True)]
@@ -51,8 +52,12 @@ class Request[R](Tagged):
     WHOLE: ClassVar = True
 
 
-class Question[R](Request[R]):
-    """A request that the session answers by itself: all that an observer may send."""
+class SessionRequest[R](Request[R]):
+    """A request that the session answers by itself: the engine does not hear of it."""
+
+
+class Question[R](SessionRequest[R]):
+    """All that an observer may send."""
 
 
 class Hello(Question[r.WelcomeReply], op="hello", kw_only=True):
@@ -266,11 +271,32 @@ class Resume(ByHand[r.DrainReply], op="resume"):
     """Grant again."""
 
 
-class Prepare(Request[r.PrepareReply], op="prepare"):
+class Prepare(SessionRequest[r.PrepareReply], op="prepare"):
     """A hint: the consumer's model is wanted soon. It is passed on to the consumer, which may read
     its weights into host RAM; it grants nothing and evicts nothing."""
 
     consumer: Name
+
+
+@dataclass(frozen=True, slots=True)
+class ConsumerDemand:
+    """How many requests of its own clients are in flight at a consumer, and wait for it."""
+
+    __pydantic_config__: ClassVar = STRICT
+    WHOLE: ClassVar = True
+
+    consumer: Name
+    in_flight: Count
+    waiting: Count
+
+
+class Demand(SessionRequest[r.DoneReply], op="demand"):
+    """What a client that serves consumers tells of their requests, for `status` alone. It replaces
+    what the client told before, and is forgotten with its connection."""
+
+    consumers: Annotated[
+        tuple[ConsumerDemand, ...], Limits(max_length=d.DEMANDS_MAX, fail_fast=True)
+    ]
 
 
 class Ping(Question[r.PingReply], op="ping"):
@@ -308,6 +334,7 @@ type AnyRequest = (
     | Drain
     | Resume
     | Prepare
+    | Demand
     | Ping
     | Bye
 )

@@ -92,6 +92,16 @@ class Totals:
 
 
 @dataclass(frozen=True, slots=True)
+class DemandView:
+    """Requests at a consumer, with or without a lease, as the client tells that serves it."""
+
+    consumer: str
+    in_flight: int
+    waiting: int
+    client: str
+
+
+@dataclass(frozen=True, slots=True)
 class HostRamView:
     """Host RAM for parked weights."""
 

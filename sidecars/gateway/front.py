@@ -45,6 +45,18 @@ LOOK_BYTES: Final = 4096
 SHOWN_AS: Final = {"away": "stopped", "queued": "starting", "leaving": "stopping"}
 """llama-swap's word of a state, where it has another one."""
 
+OPERATIONS: Final[Mapping[str, tuple[str, str]]] = {
+    "/v1/chat/completions": ("chat", "openai"),
+    "/v1/completions": ("text_completion", "openai"),
+    "/v1/responses": ("chat", "openai"),
+    "/v1/embeddings": ("embeddings", "openai"),
+    "/v1/messages": ("chat", "anthropic"),
+}
+"""OpenTelemetry's names of what a path does, and of the API that it is of. Requests of other paths
+are none of `gen_ai`."""
+FIRST_IS_A_TOKEN: Final = frozenset(("/v1/chat/completions", "/v1/completions"))
+"""Streams that begin with a token. Others begin with an event that is sent before there is one."""
+
 type Answer = Callable[[web.BaseRequest, Asker], web.StreamResponse]
 
 
@@ -136,9 +148,8 @@ class Front:
             reply = Reply(request, self._config.keep_alive_s)
             model, stream = await self._read_model(reply, body, hold)
             server = self._server_of(model, asker)
-            return await self._pass_on(
-                reply if stream else Reply(request, None), asker, server, target, bytes(body)
-            )
+            reply = reply if stream else Reply(request, None)
+            return await self._pass_on(reply, asker, server, target, bytes(body), model)
 
     async def _read_model(
         self, reply: Reply, body: bytearray, hold: Callable[[int], None]
@@ -190,9 +201,16 @@ class Front:
             self._held_bytes -= held
 
     async def _pass_on(
-        self, reply: Reply, asker: Asker, server: Server, target: str, begun: bytes = b""
+        self,
+        reply: Reply,
+        asker: Asker,
+        server: Server,
+        target: str,
+        begun: bytes = b"",
+        model: str = "",
     ) -> web.StreamResponse:
-        """Wait for the server, and let it answer. `begun`: what was read of the body."""
+        """Wait for the server, and let it answer. `begun`: what was read of the body; `model`: the
+        one that it names."""
         fields = proxy.upstream_fields(
             reply.request,
             checked=bool(self._keys),
@@ -200,7 +218,7 @@ class Front:
         )
 
         def turn() -> AbstractAsyncContextManager[Turn]:
-            return self._turn(reply.request, server, asker)
+            return self._turn(reply, server, asker, target.partition("?")[0], model)
 
         tries = CONNECT_TRIES
         while True:
@@ -228,12 +246,13 @@ class Front:
 
     @asynccontextmanager
     async def _turn(
-        self, request: web.BaseRequest, server: Server, asker: Asker
+        self, reply: Reply, server: Server, asker: Asker, path: str, model: str
     ) -> AsyncIterator[Turn]:
-        """Record a turn of the request: span, wait, duration, and that it waits or is in flight."""
+        """Record a turn of the request: span, wait, durations, and that it waits or is in
+        flight."""
         now = asyncio.get_running_loop().time
         labels = {telemetry.ATTR_CONSUMER: server.name}
-        came, traceparent = now(), request.headers.get("traceparent")
+        came, traceparent = now(), reply.request.headers.get("traceparent")
         with tracing.span(telemetry.SPAN_GATEWAY_REQUEST, traceparent, labels):
             awake, phase = server.state == "ready", telemetry.METRIC_GATEWAY_WAITING
             meters.shift(phase, 1, labels)
@@ -250,7 +269,8 @@ class Front:
                     yield turn
             finally:
                 meters.shift(phase, -1, labels)
-            meters.measure(telemetry.METRIC_GATEWAY_REQUEST, now() - granted, labels)
+            if path in OPERATIONS:
+                _measure(reply, path, model, granted, labels)
 
     # -- the gateway's own answers
     def _models(self, request: web.BaseRequest, asker: Asker) -> web.Response:
@@ -303,6 +323,25 @@ class Front:
         """Return the servers that `?model=` names, or all. Raises UnknownModel."""
         model = request.query.get("model")
         return self._visible(asker) if model is None else [self._server_of(model, asker)]
+
+
+def _measure(
+    reply: Reply, path: str, model: str, granted: float, labels: Mapping[str, str]
+) -> None:
+    """Measure an answered request of OPERATIONS by OpenTelemetry's names. `granted`: when its
+    server could take it (seconds of the loop)."""
+    operation, provider = OPERATIONS[path]
+    labels = {
+        **labels,
+        telemetry.ATTR_CHAT_OPERATION: operation,
+        telemetry.ATTR_PROVIDER: provider,
+        **({telemetry.ATTR_REQUEST_MODEL: model} if model else {}),
+    }
+    if reply.event_at is not None and path in FIRST_IS_A_TOKEN:
+        meters.measure(telemetry.METRIC_GATEWAY_FIRST_TOKEN, reply.event_at - granted, labels)
+    failed = {telemetry.ATTR_ERROR_TYPE: str(reply.status)} if reply.status >= 400 else {}
+    took_s = asyncio.get_running_loop().time() - granted
+    meters.measure(telemetry.METRIC_GATEWAY_REQUEST, took_s, labels | failed)
 
 
 async def _write(response: web.StreamResponse, data: bytes) -> None:

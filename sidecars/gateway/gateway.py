@@ -6,7 +6,8 @@ import logging
 import resource
 import signal
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from heapq import nlargest
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +16,8 @@ from aiohttp.web_protocol import RequestHandler
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.config.gateway import GatewayConfig
-from vram_arbiter.schemas.errors import BadRequest, ConfigError
+from vram_arbiter.schemas.defaults import DEMANDS_MAX, PROCESS_SHARE
+from vram_arbiter.schemas.errors import BadRequest, ConfigError, VramError
 from vram_arbiter.schemas.urls import HttpAddress, http_address
 from vram_arbiter.sidecars.gateway.front import Front
 from vram_arbiter.sidecars.gateway.keys import Keys, private_text, read_keys
@@ -32,6 +34,10 @@ TOLD_MAX: Final = 200
 """Characters of what is wrong with a head."""
 OPEN_FILES: Final = 65_536
 """A request takes two: the usual soft limit of 1,024 is too few for 1,000 clients that wait."""
+TELL_S: Final = 1.0
+"""Shortest time between two messages to the arbiter about requests."""
+BUSIEST_MAX: Final = int(DEMANDS_MAX * PROCESS_SHARE)
+"""Servers whose requests are told: as many as one process may tell of, unless configured."""
 SHUTDOWN_S: Final = 0.1
 """For answers that are almost sent; 0 would be no limit."""
 
@@ -115,6 +121,27 @@ def _allow_files() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
+async def _tell(client: AsyncClient, servers: Collection[Server]) -> None:
+    """Tell the arbiter how many requests are in flight and wait, after changes."""
+    told: Mapping[str, tuple[int, int]] = {}
+    moved = asyncio.Event()
+    for server in servers:
+        server.on_change = moved.set
+    while True:
+        await moved.wait()
+        moved.clear()
+        counts = {server.name: (server.in_flight, server.waiting) for server in servers}
+        busiest = nlargest(BUSIEST_MAX, counts, key=lambda name: sum(counts[name]))
+        found = {name: counts[name] for name in sorted(busiest) if any(counts[name])}
+        if found != told:
+            told = found
+            try:
+                await client.demand(found)
+            except VramError as error:
+                log.warning("the arbiter is not told of requests: %s", error)
+        await asyncio.sleep(TELL_S)
+
+
 async def run(config: GatewayConfig, endpoint: str | None) -> None:
     """Serve until SIGTERM or SIGINT, then end the servers. Prints the address once it listens.
 
@@ -144,10 +171,12 @@ async def run(config: GatewayConfig, endpoint: str | None) -> None:
         port = listening.sockets[0].getsockname()[1]
         gc.freeze()  # modules stay: no collection, which delays all requests, looks at them again
         print(f"http://{HttpAddress(wanted.host, port)}", flush=True)
+        telling = asyncio.create_task(_tell(client, servers.values()))
         await asyncio.gather(*(server.adopt() for server in servers.values()))
         try:
             await stop.wait()
         finally:
+            telling.cancel()
             listening.close()
             await listener.shutdown(SHUTDOWN_S)
             await asyncio.gather(*(server.close() for server in servers.values()))

@@ -90,7 +90,7 @@ class Program:
         return self._dismissed or self.state in LEAVING
 
     def want(self) -> None:
-        """Let it come back from its sleep."""
+        """Let it come back from its sleep, or be started where it does not run."""
         if not self._wanted:
             self._wanted = True
             self._order(WANT)

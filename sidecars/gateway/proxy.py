@@ -30,6 +30,7 @@ WS_GOING_AWAY: Final = b"\x88\x02\x03\xe9"
 """A close frame with 1001 (RFC 6455, 7.4.1)."""
 WS_HEAD_MAX_BYTES: Final = 14
 WS_PIECE_BYTES: Final = 1 << 14
+EVENT_STREAM: Final = b"text/event-stream"
 HOP_BY_HOP: Final = frozenset(
     (b"connection", b"keep-alive", b"proxy-authenticate", b"proxy-authorization",
      b"proxy-connection", b"te", b"trailer", b"transfer-encoding", b"upgrade")
@@ -185,8 +186,10 @@ async def _answer(connection: Connection, reply: Reply) -> Head:
     if not reply.lasts:
         fields.append((b"Connection", b"close"))
     said = b"" if reply.streams else _head(start, fields)
-    reply.passes = True
-    await connection.pass_body(said, body, reply.transport, request.writer.drain)
+    reply.passes, reply.status = True, head.status
+    streams = any(kind.startswith(EVENT_STREAM) for kind in head.values(b"content-type"))
+    on_event = reply.streamed if streams and head.status == 200 else None
+    await connection.pass_body(said, body, reply.transport, request.writer.drain, on_event)
     return head
 
 

@@ -68,12 +68,15 @@ class Reply:
     (`: waiting`) go before it.
 
     `streams`: the head of the event stream is sent. `passes`: the head of the server's answer.
-    `lasts`: another request may follow it.
+    `lasts`: another request may follow it. `status`: the server's; 0: it has not answered.
+    `event_at`: time of the first event that it streamed (seconds of the loop).
     """
 
     def __init__(self, request: web.BaseRequest, every_s: float | None) -> None:
         self.request, self._every_s = request, every_s
         self.streams = self.passes = self.lasts = False
+        self.status = 0
+        self.event_at: float | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._asked_for_body = False
 
@@ -99,6 +102,9 @@ class Reply:
         if waits and not self._asked_for_body and not self.request.content.is_eof():
             self._asked_for_body = True
             self.transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
+
+    def streamed(self) -> None:
+        self.event_at = asyncio.get_running_loop().time()
 
     def fail(self, error: VramError) -> web.StreamResponse:
         """Say the error, as far as the answer can still say one: else cut the connection."""

@@ -80,6 +80,7 @@ class Server:
         self, name: str, config: ServerConfig, client: AsyncClient, reserved: Mapping[str, int]
     ) -> None:
         self.name, self.config, self.log = name, config, Log(name)
+        self.on_change: Callable[[], None] = lambda: None
         self.switches = 0
         """How often its program was started or woken."""
         self._client = client
@@ -232,6 +233,7 @@ class Server:
 
     def _advance(self) -> None:
         """Do what is due after any change."""
+        self.on_change()
         program, now = self._program, self._now()
         if self._closed:
             return
@@ -253,7 +255,7 @@ class Server:
                     begins.set_result(program)
             if not self.in_flight and not self.waiting and self.config.idle_s is not None:
                 self._after("idle", self.config.idle_s, self._idle)
-        elif program.state in ASLEEP and self.waiting:
+        elif self.waiting and (program.state in ASLEEP or not program.granted):
             program.want()
         elif program.state == "queued" and not (self.waiting or program.granted or self._adopted):
             program.end()  # give up its place: no request waits

@@ -19,6 +19,8 @@ and a request that meets that fails."""
 HIGH_BYTES: Final = 1 << 16
 """More than this is not held for a receiver; no head is longer."""
 SWITCHING: Final = 101
+EVENT: Final = b"data:"
+"""Begins the data of an event (WHATWG HTML, 9.2.6)."""
 _FIELD: Final = re.compile(rb"([!#$%&'*+.^_`|~\w-]++):[ \t]*+([^\r\n\0]*)\r\n", re.ASCII)
 _HEAD: Final = re.compile(
     rb"(?P<line>HTTP/1\.(?P<version>[01]) (?P<code>[1-5]\d\d)(?P<reason>(?: [^\r\n\0]*)?)\r\n)"
@@ -148,6 +150,7 @@ class Connection(asyncio.Protocol):
         self._data = bytearray()  # came, and is not taken
         self._body: Body = Counted(0)
         self._sink: asyncio.WriteTransport | None = None  # where the body goes
+        self._on_event: Callable[[], None] | None = None  # waits for the first event of a stream
         self._blocked = False
         self._ended: Exception | None = None
         self._changed = asyncio.Event()
@@ -164,7 +167,10 @@ class Connection(asyncio.Protocol):
             full = len(self._data) > HIGH_BYTES
         else:
             try:
-                sink.write(self._body.take(data))
+                passed = self._body.take(data)
+                sink.write(passed)
+                if self._on_event is not None:
+                    self._look_for_event(passed)
             except SidecarUnavailable as error:
                 self.fail(error)
             full = sink.get_write_buffer_size() > HIGH_BYTES
@@ -218,11 +224,14 @@ class Connection(asyncio.Protocol):
         body: Body,
         sink: asyncio.WriteTransport,
         drained: Callable[[], Awaitable[None]],
+        on_event: Callable[[], None] | None = None,
     ) -> None:
-        """Send `head` and the body to `sink`, until the body is over. Raises what ended the
-        connection before."""
-        sink.write(head + body.take(self._take()))
-        self._body, self._sink = body, sink
+        """Send `head` and the body to `sink`, until the body is over. `on_event`: called at the
+        first event of an event stream. Raises what ended the connection before."""
+        passed = body.take(self._take())
+        sink.write(head + passed)
+        self._body, self._sink, self._on_event = body, sink, on_event
+        self._look_for_event(passed)
         try:
             while not body.over and self._ended is None:
                 self._changed.clear()
@@ -230,10 +239,16 @@ class Connection(asyncio.Protocol):
                 self._transport.resume_reading()
                 await self._changed.wait()
         finally:
-            self._sink = None
+            self._sink = self._on_event = None
             self._transport.resume_reading()  # for the next request
         if self._ended is not None and not body.over and body.bounded:
             raise self._ended
+
+    def _look_for_event(self, data: bytes) -> None:
+        """Servers may send comments before the first event."""
+        if self._on_event is not None and EVENT in data:
+            self._on_event()
+            self._on_event = None
 
     async def read(self) -> bytes:
         """Return what came; b"" at the end."""

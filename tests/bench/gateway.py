@@ -23,7 +23,7 @@ import yaml
 
 from tests.bench import gpu_broker
 from tests.bench.chats import Answer, Load, drive, turns
-from tests.bench.harness import SHIPPED, Suite, arbiter, p50, p99
+from tests.bench.harness import SHIPPED, Suite, arbiter, p50, p99, summed
 from tests.bench.paced import at_rate, chat, read_all, request
 from tests.support.waiting import until
 from vram_arbiter.schemas import fakegpu
@@ -262,7 +262,7 @@ def main() -> int:
     if options.minutes:
         turning(suite, options.minutes, with_broker=options.gpu_broker)
     suite.write(options.out)
-    print(f"{suite.table()}\nrows are in {options.out}")
+    print(f"{suite.table()}\n{summed(row.ok for row in suite.rows)}; rows are in {options.out}")
     return 0
 
 

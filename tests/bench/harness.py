@@ -15,7 +15,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -192,6 +193,12 @@ class Suite:
         path.write_text(
             json.dumps([asdict(row) for row in self.rows], indent=1, ensure_ascii=False) + "\n"
         )
+
+
+def summed(found: Iterable[bool | None]) -> str:
+    """Say how many targets were met and missed. `found`: `ok` of each row."""
+    counts = Counter(found)
+    return f"{counts[True]} targets met, {counts[False]} missed"
 
 
 def _number(value: float | None) -> str:

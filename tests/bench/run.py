@@ -10,7 +10,6 @@ left out: neither is here to be measured.
 import argparse
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 from tests.bench import (
@@ -26,7 +25,7 @@ from tests.bench import (
     bench_runner,
     bench_throughput,
 )
-from tests.bench.harness import Row, Suite
+from tests.bench.harness import Suite, summed
 
 SUBJECTS = {
     "grants": bench_grants.run,
@@ -68,15 +67,11 @@ def main() -> int:
         suite.skipped("against etcd and nvshare", "not here")
     if names != [RUNNER]:
         suite.write(options.out)
-        print(f"{suite.table()}\n{_sum(suite.rows)}; rows are in {options.out}")
+        print(f"{suite.table()}\n{summed(row.ok for row in suite.rows)}; rows are in {options.out}")
     if runner_rows:
-        print(f"\n{bench_runner.table(runner_rows)}\n{_sum(runner_rows)}; rows are in {runner_out}")
+        targets = summed(row.ok for row in runner_rows)
+        print(f"\n{bench_runner.table(runner_rows)}\n{targets}; rows are in {runner_out}")
     return 0
-
-
-def _sum(rows: Sequence[Row] | Sequence[bench_runner.RunnerRow]) -> str:
-    met, missed = (sum(row.ok is found for row in rows) for found in (True, False))
-    return f"{met} targets met, {missed} missed"
 
 
 if __name__ == "__main__":

@@ -203,7 +203,7 @@ def judge(trace: Trace, collector: Collector) -> None:
     assert "execute_rskill" in [plan.attributes[telemetry.ATTR_OUTCOME] for plan in plans]
 
     chats = [chat for plan in plans for chat in trace.below(plan, "chat m")]
-    assert {chat.attributes[llm_names.ATTR_PROVIDER] for chat in chats} == {"openai"}
+    assert {chat.attributes[telemetry.ATTR_PROVIDER] for chat in chats} == {"openai"}
     assert 1200 in [chat.attributes.get(llm_names.ATTR_INPUT_TOKENS) for chat in chats]
 
     look, _ = trace.below(task, telemetry.SPAN_REASONER_TICK)

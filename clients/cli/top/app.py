@@ -29,9 +29,9 @@ class Top(App[None]):
 
     CSS = """
     Screen { layout: vertical; }
-    #head, #gpus, #titles, #selected, #events, #keys { height: auto; }
+    #head, #gpus, #titles, #demands, #selected, #events, #keys { height: auto; }
     #titles { text-style: bold underline; }
-    #selected, #events { border-top: solid $panel; }
+    #demands, #selected, #events { border-top: solid $panel; }
     #selected { max-height: 50%; }
     Leases { height: 1fr; min-height: 3; scrollbar-size-vertical: 1; overflow-x: hidden; }
     """
@@ -55,6 +55,7 @@ class Top(App[None]):
         yield Static(id="gpus")
         yield Static(id="titles")
         yield Leases()
+        yield Static(id="demands")
         yield Static(id="selected")
         yield Static(id="events")
         yield Static(id="keys")
@@ -91,6 +92,10 @@ class Top(App[None]):
         base.query_one("#titles", Static).update(Text(table.head(), no_wrap=True))
         base.query_one(Leases).show(rows, table)
         self._show_selected()
+        demands = base.query_one("#demands", Static)
+        lines = gpus.demands(status, width, self.size.height)
+        demands.update(Text("\n".join(lines), no_wrap=True))
+        demands.display = bool(lines)
         most = 1 if self.size.height <= 24 else 1 + (self.size.height - 24) // 3
         shown = Text("\n".join(fitted(line, width) for line in list(feed.events)[-most:]))
         base.query_one("#events", Static).update(shown)

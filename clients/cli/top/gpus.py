@@ -7,8 +7,10 @@ from math import ceil
 
 from rich.cells import cell_len
 
+from vram_arbiter.clients.cli import text
 from vram_arbiter.clients.cli.text import duration, plural
 from vram_arbiter.clients.cli.top.rows import Row, brief_bytes, fitted
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.views import GpuView
@@ -136,6 +138,14 @@ def _bar(gpu: GpuView, width: int) -> str:
     kept = min(inner - charged - strange, cells(gpu.reserve_bytes))
     free = inner - charged - strange - kept
     return f"[{'█' * charged}{'▒' * strange}{'░' * free}{'·' * kept}]"
+
+
+def demands(status: StatusReply, width: int, height: int) -> list[str]:
+    """Return the requests at consumers; of many, those that fit into a fifth of the terminal."""
+    lines = text.demand_lines([to_map(one) for one in status.demands])
+    most = max(2, height // 5)
+    more = [f"and {len(lines) - most + 1} more"] if len(lines) > most else []
+    return [fitted(line, width) for line in [*lines[: most - len(more)], *more]]
 
 
 def selected_lines(row: Row | None) -> list[str]:

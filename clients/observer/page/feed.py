@@ -184,7 +184,8 @@ def _pages(status: StatusReply) -> list[bytes]:
     """Return a whole status, some leases a message."""
     found = []
     for start in range(0, max(1, len(status.leases)), FEW_LEASES):
-        some = replace(status, leases=status.leases[start : start + FEW_LEASES], daemon=None)
+        leases, demands = status.leases[start : start + FEW_LEASES], () if start else status.demands
+        some = replace(status, leases=leases, demands=demands, daemon=None)
         found.append(_event("page" if start else "snapshot", some))
     return found
 

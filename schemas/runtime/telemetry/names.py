@@ -58,6 +58,13 @@ EVENT_PREFETCH_MISS = "vram.event.chunk_prefetch_miss"
 
 # -- metrics: name, unit and description, as a collector shows them, and bounds of a histogram;
 # those of the arbiter are in `clients.observer.names`
+CHATS_S = tuple(0.01 * 2**n for n in range(14))
+"""Bounds that OpenTelemetry's conventions give for requests to language models, and for the time to
+a first token."""
+FIRST_TOKENS_S = (
+    *(0.001, 0.005, 0.01, 0.02, 0.04, 0.06, 0.08),
+    *(0.1, 0.25, 0.5, 0.75, 1.0, 2.5, 5.0, 7.5, 10.0),
+)
 WAITS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
 TICKS_S = (
     *(0.0005, 0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.033, 0.04, 0.05),
@@ -122,7 +129,10 @@ METRIC_GATEWAY_IN_FLIGHT = metric(
     "vram_gateway.requests.in_flight", "{request}", "Requests at their servers"
 )
 METRIC_GATEWAY_REQUEST = metric(
-    "gen_ai.server.request.duration", "s", "A request from its server's grant to its end", WAITS_S
+    "gen_ai.server.request.duration", "s", "A request from its server's grant to its end", CHATS_S
+)
+METRIC_GATEWAY_FIRST_TOKEN = metric(
+    "gen_ai.server.time_to_first_token", "s", "A server's grant to a token", FIRST_TOKENS_S
 )
 METRIC_CPU_TIME = metric("process.cpu.time", "s", "CPU time of this process")
 METRIC_MEMORY = metric("process.memory.usage", "By", "RAM of this process")
@@ -146,7 +156,10 @@ ATTR_COMPONENT = "vram.component"  # of the world state: a sensor, joint_state, 
 ATTR_CHECK = "safety.check_name"  # a `Check` of runner.safety.violations
 ATTR_SEVERITY = "safety.severity"  # error: why an action is withheld; warning: all others
 ATTR_CPU_MODE = "cpu.mode"
-ATTR_ERROR_TYPE = "error.type"  # a code of schemas.errors, or an exception's class
+ATTR_ERROR_TYPE = "error.type"  # a code of schemas.errors, an exception's class, HTTP's status
+ATTR_CHAT_OPERATION = "gen_ai.operation.name"
+ATTR_PROVIDER = "gen_ai.provider.name"
+ATTR_REQUEST_MODEL = "gen_ai.request.model"
 ATTR_EXCEPTION_TYPE = "exception.type"  # of log records, as OpenTelemetry's conventions say
 ATTR_EXCEPTION_MESSAGE = "exception.message"
 ATTR_EXCEPTION_STACKTRACE = "exception.stacktrace"

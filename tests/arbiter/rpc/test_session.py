@@ -542,6 +542,47 @@ def test_one_process_does_not_take_all_subscriptions() -> None:
     assert session_bench.ask("subscribe", b"p")["ok"]
 
 
+# -- requests at consumers
+def told(consumer: str, in_flight: int = 1, waiting: int = 0) -> dict[str, Any]:
+    return {"consumer": consumer, "in_flight": in_flight, "waiting": waiting}
+
+
+def test_a_status_counts_requests_as_long_as_their_client_is_there(session_bench: Bench) -> None:
+    """The engine hears nothing of it. Only the first page of a status has it."""
+    session_bench.hello(b"a", name="gateway")
+    session_bench.hello(b"v", role="observer")
+    acquire(session_bench)
+    session_bench.concerned.add(session_bench.client(b"a"))
+    session_bench.events.clear()
+    assert session_bench.ask("demand", b"a", consumers=[told("x"), told("y")])["ok"]
+    assert session_bench.ask("demand", b"a", consumers=[told("llm", 3, 12)])["ok"]
+    shown = session_bench.ask("status", b"v")["demands"]
+    assert shown == [told("llm", 3, 12) | {"client": "gateway"}], "the last replaces all"
+    assert "demands" not in session_bench.ask("status", b"v", after=[1, 2.5, 3])
+    assert code(session_bench.ask("demand", b"v", consumers=[])) == "not_permitted"
+    for wrong in (told("llm", -1), told("llm", 1 << 31), told("a\nb"), {"consumer": "llm"}):
+        assert code(session_bench.ask("demand", b"a", consumers=[wrong])) == "bad_request"
+    assert session_bench.events == []
+    session_bench.hang_up(b"a")
+    assert session_bench.left() == [], "its leases stay for a while"
+    assert "demands" not in session_bench.ask("status", b"v")
+
+
+def test_one_process_does_not_tell_of_all_consumers_of_a_status() -> None:
+    share = 4 / d.DEMANDS_MAX
+    session_bench = make_bench(process_share=share, sessions_max=1000)
+    for via in (b"a", b"b"):
+        session_bench.hello(via)
+    three, two = ([told(f"m{number}") for number in range(count)] for count in (3, 2))
+    assert session_bench.ask("demand", b"a", consumers=three)["ok"]
+    assert session_bench.ask("demand", b"a", consumers=three)["ok"], "in place of the same"
+    refused = session_bench.ask("demand", b"b", consumers=two)
+    assert refused["error"]["details"] == {"limit": "process_share", "value": 4}
+    session_bench.hello(b"p", peer=PARENT)
+    assert session_bench.ask("demand", b"p", consumers=two)["ok"]
+    assert len(session_bench.ask("status", b"p")["demands"]) == 5
+
+
 def test_pushes_are_numbered_per_session(session_bench: Bench) -> None:
     session_bench.hello(b"a")
     for _ in range(3):

@@ -5,7 +5,7 @@ from tests.support.protocol_wire import WELCOME, Wire, view
 from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.connection import HELLO_TIMEOUT_S, SILENCE_BEATS
 from vram_arbiter.schemas.errors import ArbiterUnreachable, VersionMismatch
-from vram_arbiter.schemas.wire.requests import AskWhy, Status
+from vram_arbiter.schemas.wire.requests import AskWhy, ConsumerDemand, Demand, Status
 
 
 # -- greeting
@@ -142,6 +142,16 @@ def test_a_subscription_outlives_the_connection(link: Wire) -> None:
     link.told()
     link.greet()
     link.one("subscribe")
+
+
+def test_what_was_told_of_requests_is_told_again_after_a_reconnect(link: Wire) -> None:
+    for waiting in (1, 2):
+        link.protocol.demand(Demand((ConsumerDemand("llm", 3, waiting),)), link.now)
+        link.reply(link.one("demand"))
+    link.connection.contact_lost("test")
+    link.told()
+    link.greet()
+    assert link.one("demand")["consumers"] == [{"consumer": "llm", "in_flight": 3, "waiting": 2}]
 
 
 def test_an_answer_of_another_shape_fails_its_request(link: Wire) -> None:

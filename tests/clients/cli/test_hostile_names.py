@@ -64,6 +64,7 @@ STATUS = said.STATUS | {
     "problems": ["the journal cannot be written"],
     "gpus": [GPU],
     "leases": [said.LEASE, said.LEASE | {"state": "queued", "position": 1}],
+    "demands": [{"consumer": "llm", "in_flight": 1, "waiting": 2, "client": "gateway"}],
 }
 WHY = {"consumer": "grab", "leases": [said.WAITS | {"plan": [{"text": "x leaves"}]}]}
 EVENT = {

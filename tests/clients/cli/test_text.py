@@ -89,6 +89,24 @@ def test_status() -> None:
     ]
 
 
+def test_status_counts_requests_at_consumers_with_and_without_a_lease() -> None:
+    demands = [
+        {"consumer": "detector", "in_flight": 3, "waiting": 0, "client": "vram-gateway"},
+        {"consumer": "llm", "in_flight": 0, "waiting": 12, "client": "vram-gateway"},
+    ]
+    table = [
+        "",
+        "REQUESTS OF  IN FLIGHT  WAITING  TOLD BY",
+        "detector             3        0  vram-gateway",
+        "llm                  0       12  vram-gateway",
+    ]
+    assert text.status_lines(STATUS | {"demands": demands})[-4:] == table
+    assert text.status_lines(STATUS | {"leases": [], "demands": demands})[-5:] == [
+        "no leases",
+        *table,
+    ]
+
+
 def test_status_says_what_is_wrong_with_the_daemons_own_files() -> None:
     problems = [
         "the journal cannot be written (disk full): what is held stays, nothing new is granted"

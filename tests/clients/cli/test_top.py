@@ -38,6 +38,7 @@ from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.requests import Acquire
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
+from vram_arbiter.schemas.wire.views import DemandView
 
 DEADLINE_S = 60.0
 STRANGER = 65534
@@ -145,6 +146,9 @@ async def test_80_by_24(daemon: ArbiterProcess, held_detector: Lease) -> None:
         await pilot.pause()
         assert keys(pilot) == "grab waits: it has no bytes to evict"
         assert len(pilot.app.screen_stack) == 1, "no dialog for what would be refused"
+        async with AsyncClient("gateway", endpoint=daemon.endpoint) as client:
+            await client.demand({"llm": (3, 12)})
+            await until_shown(pilot, lambda: "llm 3 12 gateway" in map(words, screen(pilot)))
 
 
 @pytest.mark.e2e
@@ -290,13 +294,19 @@ def test_columns_fit_and_obey_no_name(told_lines: StatusReply, width: int) -> No
         replace(one, consumer=HOSTILE, model=HOSTILE, charge_bytes=999 * GIB + MIB)
         for one in told_lines.leases
     )
-    poisoned = replace(told_lines, leases=hostile, drained=HOSTILE, problems=(HOSTILE,))
+    demands = (DemandView(HOSTILE, 3, 12, HOSTILE),) * 9
+    poisoned = replace(
+        told_lines, leases=hostile, demands=demands, drained=HOSTILE, problems=(HOSTILE,)
+    )
     table = Table(width)
     rows = rows_of(poisoned)
     lines = [table.head(), *(table.line(row) for row in rows), *(table.reason(row) for row in rows)]
     assert {cell_len(line) for line in lines[: 1 + len(rows)]} == {width}
     lines += gpus.panel(poisoned, [Samples()], width, 24)
     lines += [gpus.header(poisoned, "operator", width)]
+    requests = gpus.demands(poisoned, width, 24)
+    assert (len(requests), requests[-1]) == (4, "and 7 more"), "the list of leases needs the room"
+    lines += requests
     assert all(cell_len(line) <= width for line in lines)
     lines += [line for row in rows for line in gpus.selected_lines(row)]  # the screen wraps them
     said = "".join([*lines, *gpus.notices(poisoned)])

@@ -65,6 +65,10 @@ RECORDED: list[tuple[w.AnyRequest, dict[str, Any]]] = [
     (w.Drain("r"), {"op": "drain", "reason": "r"}),
     (w.Resume("r"), {"op": "resume", "reason": "r"}),
     (w.Prepare("c"), {"op": "prepare", "consumer": "c"}),
+    (
+        w.Demand((w.ConsumerDemand("c", 1, 2),)),
+        {"op": "demand", "consumers": [{"consumer": "c", "in_flight": 1, "waiting": 2}]},
+    ),
     (w.Ping(), {"op": "ping"}),
     (w.Bye(), {"op": "bye"}),
 ]

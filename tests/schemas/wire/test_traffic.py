@@ -98,6 +98,7 @@ def everything(connect: Callable[..., RecordedClient]) -> list[RecordedClient]:
     holder.ask("renew", leases=[ref])
     holder.ask("oom", **ref, requested_bytes=GIB, allocated_bytes=5 * GIB)
     assert other.acquire("chat", GIB, gpu="no-such-gpu")["ok"] is False
+    other.ask("demand", consumers=[{"consumer": "chat", "in_flight": 1, "waiting": 2}])
     for op in ("status", "ping"):
         other.ask(op)
     other.ask("history", after=0, limit=100)

@@ -28,14 +28,21 @@ from vram_arbiter.clients.sync import Client
 from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.llm.http import JsonHttp
 from vram_arbiter.schemas.runtime.telemetry.names import (
+    ATTR_CHAT_OPERATION,
     ATTR_CONSUMER,
+    ATTR_PROVIDER,
+    ATTR_REQUEST_MODEL,
     EVENT_FIRST_BYTE,
     EVENT_GRANTED,
     EVENT_WOKEN,
+    METRIC_GATEWAY_FIRST_TOKEN,
     METRIC_GATEWAY_IN_FLIGHT,
+    METRIC_GATEWAY_REQUEST,
     METRIC_GATEWAY_WAITING,
     SPAN_GATEWAY_REQUEST,
 )
+from vram_arbiter.schemas.wire.views import DemandView
+from vram_arbiter.sidecars.gateway.gateway import NAME
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 Start = Callable[..., GatewayProcess]
@@ -78,7 +85,8 @@ async def test_the_first_request_starts_its_server_and_an_idle_one_leaves(
             assert not started.running()
             assert await ask(client, "gpt-4o-mini") == ANSWER
             assert await ask(client, "b") == ANSWER
-            assert await ask(client, "b") == ANSWER
+            stream = await client.chat.completions.create(model="b", messages=HELLO, stream=True)
+            assert [chunk.choices[0].delta.content async for chunk in stream] == ["0 ", "1 "]
         await eventually(lambda: set(started.running()) == {"b"})  # both fit; `a` was idle
         with Client("t", endpoint=arbiter_daemon.endpoint) as arbiter:
             assert [lease.consumer for lease in arbiter.status().leases] == ["b"]
@@ -92,6 +100,18 @@ async def test_the_first_request_starts_its_server_and_an_idle_one_leaves(
         for metric in (METRIC_GATEWAY_WAITING, METRIC_GATEWAY_IN_FLIGHT):
             points = collector.points(metric)  # the last of a server stays
             assert {one.attributes[ATTR_CONSUMER]: one.value for one in points} == {"a": 0, "b": 0}
+        chat = {ATTR_CHAT_OPERATION: "chat", ATTR_PROVIDER: "openai"}
+        chats = {
+            name: chat | {ATTR_CONSUMER: server, ATTR_REQUEST_MODEL: name}
+            for server, name in (("a", "gpt-4o-mini"), ("b", "b"))
+        }
+        for metric, counts in (
+            (METRIC_GATEWAY_REQUEST, {"gpt-4o-mini": 1, "b": 2}),
+            (METRIC_GATEWAY_FIRST_TOKEN, {"b": 1}),
+        ):
+            last = {one.attributes[ATTR_REQUEST_MODEL]: one for one in collector.points(metric)}
+            assert {name: one.count for name, one in last.items()} == counts
+            assert all(one.attributes == chats[name] for name, one in last.items())
 
 
 async def test_an_eviction_waits_for_a_stream_and_equals_take_turns(shared: GatewayProcess) -> None:
@@ -186,12 +206,16 @@ async def test_a_client_that_leaves_cancels_its_request_and_gives_up_its_place(
         await eventually(lambda: shared.running().get("a", {}).get("in_flight") == 1)
         second = asyncio.create_task(ask(client, "b"))
         await eventually(lambda: shared.running().get("b", {}).get("lease") == "queued")
-        second.cancel()
-        await eventually(lambda: "b" not in shared.running())
         with Client("t", endpoint=shared.arbiter.endpoint) as arbiter:
+            a, b = (DemandView(name, *of, NAME) for name, of in (("a", (1, 0)), ("b", (0, 1))))
+            await eventually(lambda: arbiter.status().demands == (a, b))
+            second.cancel()
+            await eventually(lambda: "b" not in shared.running())
             await eventually(lambda: [lease.consumer for lease in arbiter.status().leases] == ["a"])
-        first.cancel()
-        await eventually(lambda: shared.running()["a"]["in_flight"] == 0)
+            await eventually(lambda: arbiter.status().demands == (a,))
+            first.cancel()
+            await eventually(lambda: shared.running()["a"]["in_flight"] == 0)
+            await eventually(lambda: arbiter.status().demands == ())
 
 
 async def test_a_request_that_does_not_end_is_ended_after_the_grace(

@@ -153,5 +153,25 @@ async def test_a_connection_is_read_again_after_a_large_answer(late: bool) -> No
     assert server.reads
 
 
+@pytest.mark.anyio
+async def test_the_first_event_of_a_stream_is_told_once_and_a_comment_is_none() -> None:
+    client, connection = Pipe(), Connection()
+    connection.connection_made(Pipe())
+    ping, event = (b"%x\r\n%b\r\n" % (len(one), one) for one in (b": ping\n\n", b"data: 1\n\n"))
+    connection.data_received(b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n" + ping)
+    body = (await connection.head()).body("GET", decoded=False)
+    written: list[bytes] = []  # as each event is told
+    passing = asyncio.create_task(
+        connection.pass_body(b"", body, client, drained, lambda: written.append(client.written))
+    )
+    await asyncio.sleep(0)
+    assert written == []
+    for _ in range(2):
+        connection.data_received(event)
+    connection.data_received(b"0\r\n\r\n")
+    await passing
+    assert written == [ping + event]
+
+
 async def drained() -> None:
     pass

@@ -1,4 +1,5 @@
 // The status page: draws the state of `feed.js`; every text of the daemon becomes a text node.
+import { renderDemands } from "/demands.js";
 import { renderEvictions } from "/evictions.js";
 import { Feed } from "/feed.js";
 import { $, bytes, clock, el, plural, setText, whole } from "/format.js";
@@ -22,7 +23,7 @@ function plan(...parts) {
 
 const NEEDS = {
   link: ["link"],
-  snapshot: ["link", "gpus", "leases", "queue"],
+  snapshot: ["link", "gpus", "leases", "queue", "demands"],
   page: ["leases", "queue"],
   waits: ["queue"],
   usage: ["gpus"],
@@ -38,6 +39,7 @@ function render() {
   if (parts.has("gpus")) renderGpus(feed);
   if (parts.has("queue")) renderQueue(feed);
   if (parts.has("leases")) renderLeases(feed);
+  if (parts.has("demands")) renderDemands(feed);
   if (parts.has("history")) {
     renderHistory(feed);
     announce(feed);

@@ -138,6 +138,10 @@ def test_a_lease_a_wait_and_an_eviction_are_shown_as_they_happen(page: Page) -> 
     assert len(set(chips)) == 2
     assert set(chips) < set(parts)  # a consumer has one color
 
+    assert page.run("document.querySelector('#demands').hidden")
+    client.ask("demand", consumers=[{"consumer": NAME, "in_flight": 3, "waiting": 1200}])
+    page.until(lambda: page.texts("#demand-rows td") == [NAME, "3", "1,200", "scene"], "requests")
+
     waiter = client.acquire("grab", 4 * GIB)["lease"]["lease_id"]
     reason = f"[data-lease={waiter!r}] .reason"
     page.until(lambda: "5.00 GiB from detector, in use" in page.text(reason), "the wait's reason")

@@ -7,14 +7,17 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import CoreDriver
+from tests.support.messages import IDLE_STATUS, lease_view
 from vram_arbiter.clients.observer.page import feed as feed_module
 from vram_arbiter.clients.observer.page.feed import UNREAD_MAX_BYTES, PageFeed, PageReader
 from vram_arbiter.clients.observer.page.usage import UsageRecord
 from vram_arbiter.clients.observer.present import Look
 from vram_arbiter.schemas import strictjson
+from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import HistoryReply
+from vram_arbiter.schemas.wire.views import DemandView
 
 CHUNK = bytes(256 * 1024)
 
@@ -81,6 +84,13 @@ def test_every_page_is_told_the_status_and_a_new_one_the_past(driver: CoreDriver
     names = [name for name, _ in asyncio.run(story())]
     assert names == ["snapshot", "waits", "usage", "history", "history", "snapshot", "waits"]
     assert replace(look_of(driver), at=1.0).origin == 1.0 - look_of(driver).status.uptime_s
+
+
+def test_requests_at_consumers_are_in_the_first_part_alone() -> None:
+    demands = (DemandView("llm", 3, 12, "gateway"),)
+    status = replace(IDLE_STATUS, leases=(lease_view(),) * 101, demands=demands)
+    told = [strictjson.loads(part.partition(b"data: ")[2]) for part in feed_module._pages(status)]
+    assert [one.get("demands") for one in told] == [[to_map(demands[0])], None]
 
 
 class Silent(Arbiter):
