@@ -10,7 +10,7 @@ from vram_arbiter.schemas.defaults import GIB
 @pytest.fixture(scope="session")
 def busy() -> CoreDriver:
     """A run of the engine with a bit of everything; read only."""
-    return busy_driver(7)
+    return busy_driver(7, steps=50)
 
 
 @pytest.fixture

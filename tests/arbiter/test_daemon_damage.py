@@ -8,8 +8,6 @@ these cases the next start granted another client's lease beside a living exclus
 import contextlib
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ from typing import Any
 import pytest
 
 from tests.support.process import ArbiterProcess
+from tests.support.running import Running, running
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
@@ -55,20 +54,12 @@ asyncio.run(main())
 
 
 @contextlib.contextmanager
-def holder_in_use(arbiter: ArbiterProcess) -> Iterator[subprocess.Popen[str]]:
+def holder_in_use(arbiter: ArbiterProcess) -> Iterator[Running]:
     """A process by the product's own client: an exclusive lease, bytes on the GPU, a use
     under way."""
-    holder = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(arbiter.gpu_folder)],
-        env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == "in use\n"
+    with running("script", [HOLDER, str(arbiter.gpu_folder)], arbiter.environ) as holder:
+        assert holder.line() == "in use"
         yield holder
-    finally:
-        holder.kill()
-        holder.communicate()
 
 
 def wal(database: Path) -> Path:
@@ -91,7 +82,7 @@ def test_a_damaged_journal_grants_nothing_beside_a_holder_in_use(damage: str) ->
         arbiter.start()
         database = arbiter.state / "journal.sqlite"
         with holder_in_use(arbiter) as holder:
-            holder.send_signal(
+            holder.process.send_signal(
                 signal.SIGSTOP
             )  # it cannot tell the next daemon what the journal does not
             arbiter.kill()
@@ -106,7 +97,7 @@ def test_a_damaged_journal_grants_nothing_beside_a_holder_in_use(damage: str) ->
                     e["kind"].startswith("journal_") for e in client.ask("history")["events"]
                 )
                 assert client.ask("subscribe")["ok"]
-                holder.send_signal(signal.SIGCONT)
+                holder.process.send_signal(signal.SIGCONT)
                 client.push(
                     "event", PATIENCE_S, where=lambda push: push["event"]["kind"] == "reattached"
                 )
@@ -115,7 +106,8 @@ def test_a_damaged_journal_grants_nothing_beside_a_holder_in_use(damage: str) ->
                 )
                 assert (lease["state"], lease["uses"]) == ("held", 1)
                 assert not [push for push in client.pushes if push["push"] == "granted"]
-                told, _ = holder.communicate("end\n", timeout=PATIENCE_S)
+                holder.tell("end\n")
+                told = holder.line()
                 assert told.startswith(("ends held", "ends revoking")), "it kept its lease"
                 granted = client.push("granted", PATIENCE_S)["lease"]
                 assert granted["lease_id"] == waiting["lease"]["lease_id"]

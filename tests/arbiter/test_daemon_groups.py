@@ -7,13 +7,12 @@ Real daemon, real users.
 import grp
 import json
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
+from tests.support.prepared import run
 from tests.support.process import ArbiterProcess
 
 pytestmark = pytest.mark.e2e
@@ -45,10 +44,8 @@ def groups() -> tuple[str, str]:
 
 def speak(arbiter: ArbiterProcess, role: str, primary: str, other: str) -> dict[str, Any]:
     numbers = [str(grp.getgrnam(name).gr_gid) for name in (primary, other)]
-    done = subprocess.run(
-        [sys.executable, "-c", CLIENT, arbiter.endpoint, role, *numbers],
-        env=arbiter.environ, capture_output=True, text=True, timeout=60, check=True,
-    )  # fmt: skip
+    done = run("script", [CLIENT, arbiter.endpoint, role, *numbers], arbiter.environ, 60.0)
+    assert done.returncode == 0, done.stderr
     said: dict[str, Any] = json.loads(done.stdout)
     return said
 

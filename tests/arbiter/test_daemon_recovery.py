@@ -4,8 +4,6 @@ nothing is granted on a guess."""
 import contextlib
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -13,6 +11,7 @@ from typing import Any
 import pytest
 
 from tests.support.process import ArbiterProcess
+from tests.support.running import Running, running
 from tests.support.waiting import until
 from tests.support.wire import TTL_S, WireClient
 from vram_arbiter.arbiter.host.journal import Journal
@@ -76,24 +75,13 @@ with Client(name="runner") as client, client.use(lease_id, (epoch, counter), "go
 
 
 @contextlib.contextmanager
-def runner_on(arbiter: ArbiterProcess, on: dict[str, Any]) -> Iterator[subprocess.Popen[str]]:
+def runner_on(arbiter: ArbiterProcess, on: dict[str, Any]) -> Iterator[Running]:
     """Another process, by the product's own client, uses the lease whose token it was told. It ends
-    its use with a line of input."""
-    words = [on["lease_id"], *map(str, on["token"])]
-    runner = subprocess.Popen(
-        [sys.executable, "-c", RUNNER, *words],
-        env=arbiter.environ,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert runner.stdout is not None
-        assert runner.stdout.readline() == "in use\n"
+    its use with its input."""
+    words = [RUNNER, on["lease_id"], *map(str, on["token"])]
+    with running("script", words, arbiter.environ) as runner:
+        assert runner.line() == "in use"
         yield runner
-    finally:
-        runner.kill()
-        runner.communicate()
 
 
 @pytest.mark.parametrize("end", ["it goes on", "it dies"])
@@ -106,7 +94,7 @@ def test_a_user_that_is_stopped_while_the_daemon_restarts_keeps_the_holder(
     with WireClient(arbiter.endpoint) as client:
         on = hold(client.hello(), arbiter, "sidecar", 5 * GIB)
         with runner_on(arbiter, on) as runner:
-            runner.send_signal(signal.SIGSTOP)
+            runner.process.send_signal(signal.SIGSTOP)
             arbiter.kill()
             arbiter.start()
             with WireClient(arbiter.endpoint) as sidecar:
@@ -118,19 +106,18 @@ def test_a_user_that_is_stopped_while_the_daemon_restarts_keeps_the_holder(
                 refused = sidecar.ask("unloading", **on)["error"]
                 assert (refused["code"], refused["details"]["uses"]) == ("bad_state", 1)
                 if end == "it dies":
-                    runner.kill()  # the kernel tells, also of one that is stopped
+                    runner.process.kill()  # the kernel tells, also of one that is stopped
                 else:
                     assert sidecar.ask("subscribe")["ok"]
-                    runner.send_signal(signal.SIGCONT)
+                    runner.process.send_signal(signal.SIGCONT)
                     again = sidecar.push(
                         "event",
                         timeout_s=30.0,
                         where=lambda push: push["event"]["kind"] == "use_began",
                     )
                     assert again["event"]["resumed"]
-                    assert runner.communicate("end\n", timeout=30.0)[0] == "None\n", (
-                        "its use was not lost"
-                    )
+                    runner.tell("end\n")
+                    assert runner.line() == "None", "its use was not lost"
                 assert sidecar.push("revoke", where=lambda push: push["uses"] == 0)
                 assert sidecar.ask("unloading", **on)["ok"]
                 occupy(arbiter, 0)

@@ -13,7 +13,9 @@ from typing import Any
 
 import pytest
 
+from tests.support.prepared import Forked
 from tests.support.process import ArbiterProcess
+from tests.support.running import running
 from tests.support.wire import WireClient
 from vram_arbiter.schemas.runtime import procfs
 
@@ -52,25 +54,15 @@ def watcher(quick_reader: ArbiterProcess) -> Iterator[WireClient]:
 
 
 @contextlib.contextmanager
-def job(
-    quick_reader: ArbiterProcess, size: int, *extra: str
-) -> Iterator[tuple["subprocess.Popen[str]", int]]:
+def job(quick_reader: ArbiterProcess, size: int, *extra: str) -> Iterator[tuple[Forked, int]]:
     """`vramctl run` of a child that holds `size` until its stdin closes: (vramctl, the child's
     pid)."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "vram_arbiter.clients", "run", "--vram", "5GiB", "--name", "job",
-        "--",
-         *extra, sys.executable, "-c", CHILD, str(quick_reader.gpu_folder), str(size)],
-        env=quick_reader.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert process.stdin is not None
-    assert process.stdout is not None
-    try:
-        yield process, int(process.stdout.readline())
-    finally:
-        process.stdin.close()  # the child ends, and vramctl with it
-        process.wait(PATIENCE_S)
-        process.stdout.close()
+    child = [sys.executable, "-c", CHILD, str(quick_reader.gpu_folder), str(size)]
+    words = ("run", "--vram", "5GiB", "--name", "job", "--", *extra, *child)
+    with running("vramctl", words, quick_reader.environ) as run:
+        yield run.process, int(run.line())
+        run.tell()  # the child ends, and vramctl with it
+        run.ended()
 
 
 def gpu_when(watcher: WireClient, when: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:

@@ -3,13 +3,14 @@
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from tests.support.process import ArbiterProcess
+from tests.support.prepared import run
+from tests.support.process import ArbiterProcess, Finished
+from tests.support.running import running
 from vram_arbiter import Client
 
 pytestmark = pytest.mark.e2e
@@ -22,12 +23,13 @@ def environ(daemon: ArbiterProcess) -> dict[str, str]:
     return {**daemon.environ, "VRAM_ARBITER_ENDPOINT": daemon.endpoint}
 
 
-def run(daemon: ArbiterProcess, name: str, *arguments: str, by: str = sys.executable) -> str:
+def example(daemon: ArbiterProcess, name: str, *arguments: str) -> Finished:
+    return run("script", [str(EXAMPLES / name), *arguments], environ(daemon), LIMIT_S)
+
+
+def said_by(daemon: ArbiterProcess, name: str, *arguments: str) -> str:
     """Return what an example prints; it must end well and warn of nothing."""
-    done = subprocess.run(
-        [by, str(EXAMPLES / name), *arguments],
-        env=environ(daemon), capture_output=True, text=True, timeout=LIMIT_S,
-    )  # fmt: skip
+    done = example(daemon, name, *arguments)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
     return done.stdout
 
@@ -50,7 +52,7 @@ def test_every_example_has_a_test() -> None:
 
 
 def test_a_consumer(arbiter_daemon: ArbiterProcess) -> None:
-    said = run(arbiter_daemon, "consumer.py").splitlines()
+    said = said_by(arbiter_daemon, "consumer.py").splitlines()
     assert said[0].startswith("detecting on GPU-")
     assert said[1] == "released: gone, 0 weights left"
     story = ["granted", "ready", "use_began", "use_ended", "released"]
@@ -58,7 +60,7 @@ def test_a_consumer(arbiter_daemon: ArbiterProcess) -> None:
 
 
 def test_two_models_take_turns(arbiter_daemon: ArbiterProcess) -> None:
-    said = run(arbiter_daemon, "taking_turns.py").splitlines()
+    said = said_by(arbiter_daemon, "taking_turns.py").splitlines()
     loaded: list[str] = []
     for line in said:
         model, what = line.split(": ")
@@ -76,7 +78,7 @@ def test_two_models_take_turns(arbiter_daemon: ArbiterProcess) -> None:
 
 
 def test_standby(arbiter_daemon: ArbiterProcess) -> None:
-    assert run(arbiter_daemon, "standby.py").splitlines() == [
+    assert said_by(arbiter_daemon, "standby.py").splitlines() == [
         "detector: loaded",
         "detector: unloaded",
         "training is loading, detector is standby",
@@ -87,7 +89,7 @@ def test_standby(arbiter_daemon: ArbiterProcess) -> None:
 
 
 def test_a_wrapped_program_runs_to_its_end(arbiter_daemon: ArbiterProcess) -> None:
-    said = run(arbiter_daemon, "wrap_program.py", "5GB", "sh", "-c", "echo working")
+    said = said_by(arbiter_daemon, "wrap_program.py", "5GB", "sh", "-c", "echo working")
     assert said == "working\n"
     assert in_order(["granted", "ready", "released"], event_kinds(arbiter_daemon, "sh"))
 
@@ -95,35 +97,29 @@ def test_a_wrapped_program_runs_to_its_end(arbiter_daemon: ArbiterProcess) -> No
 def test_wrapping_nothing_says_how(arbiter_daemon: ArbiterProcess) -> None:
     """Without arguments it ended in an IndexError."""
     for arguments in ([], ["5GB"]):
-        done = subprocess.run(
-            [sys.executable, str(EXAMPLES / "wrap_program.py"), *arguments],
-            env=environ(arbiter_daemon), capture_output=True, text=True, timeout=LIMIT_S,
-        )  # fmt: skip
+        done = example(arbiter_daemon, "wrap_program.py", *arguments)
         assert (done.returncode, done.stdout) == (2, "")
         assert done.stderr.startswith("usage: wrap_program.py VRAM PROGRAM")
 
 
 def test_a_wrapped_program_is_ended_for_another(arbiter_daemon: ArbiterProcess) -> None:
-    wrapper = subprocess.Popen(
-        [sys.executable, str(EXAMPLES / "wrap_program.py"), "5GB",
-         "sh", "-c", "echo up; exec sleep 600"],
-        env=environ(arbiter_daemon), stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        assert wrapper.stdout is not None
-        assert wrapper.stdout.readline() == "up\n"
+    program = [str(EXAMPLES / "wrap_program.py"), "5GB", "sh", "-c", "echo up; exec sleep 600"]
+    with running("script", program, environ(arbiter_daemon)) as wrapper:
+        assert wrapper.line() == "up"
         with Client("detector", endpoint=arbiter_daemon.endpoint) as arbiter:
             arbiter.acquire(wait_timeout_s=LIMIT_S, vram="5GB").release()
-        assert wrapper.communicate(timeout=LIMIT_S)[0].startswith("the room is needed")
-        assert wrapper.returncode == 128 + 15
-    finally:
-        wrapper.kill()
-        wrapper.wait()
+        assert wrapper.line().startswith("the room is needed")
+        assert wrapper.ended() == 128 + 15
 
 
 @pytest.mark.skipif(shutil.which("perl") is None, reason="Perl is not installed")
 def test_a_client_in_another_language(arbiter_daemon: ArbiterProcess) -> None:
-    said = run(arbiter_daemon, "raw_wire.pl", by="perl").splitlines()
+    done = subprocess.run(
+        ["perl", str(EXAMPLES / "raw_wire.pl")],
+        env=environ(arbiter_daemon), capture_output=True, text=True, timeout=LIMIT_S,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    said = done.stdout.splitlines()
     assert said[0].startswith("granted L")
     assert said[1:] == ["working", "released"]
     story = ["granted", "ready", "use_began", "use_ended", "released"]

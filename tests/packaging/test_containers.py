@@ -1,22 +1,18 @@
 """The images and the compose file, as far as they go without a container engine and a registry.
 
-The image is built from what its COPY lines name, installed by its pip line; its entry point runs
-as PID 1 with the restrictions of compose.yaml. A build by a real builder is described in
+The entry point runs as PID 1 with the restrictions of compose.yaml; that an image can be built from
+what its COPY lines name is shown in test_wheel.py. A build by a real builder is described in
 docs/how-to/containers.md.
 """
 
 import contextlib
-import ensurepip
 import json
 import os
 import re
-import shlex
-import shutil
 import signal
 import subprocess
 import sys
 import tomllib
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -137,41 +133,6 @@ def test_the_users_have_the_same_ids_and_names_in_both_images() -> None:
     ids = {name: f"{uid}:{gid}" for uid, gid, name in users[0]}
     assert text_of("Containerfile").user == ids[SERVICE_USERS["arbiter"]]
     assert text_of("Containerfile.sidecar").user == ids[SERVICE_USERS["sidecar"]]
-
-
-# -- what they build
-@pytest.mark.e2e
-def test_an_image_builds_from_what_it_copies(tmp_path: Path) -> None:
-    """Both copy the same; the wheel is built without an index, then installed by pip's line."""
-    pytest.importorskip("hatchling", reason="the dependency group `dev`")
-    image = text_of("Containerfile")
-    assert text_of("Containerfile.sidecar").copies == image.copies
-    source, wheels, target = (tmp_path / name for name in ("source", "wheels", "target"))
-    source.mkdir()
-    unneeded = shutil.ignore_patterns("__pycache__", "*.safetensors")
-    for name in image.copies:
-        if (TREE / name).is_dir():
-            shutil.copytree(TREE / name, source / name, symlinks=True, ignore=unneeded)
-        else:
-            shutil.copy(TREE / name, source)
-    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(wheels)]
-    subprocess.run(build, cwd=source, check=True, capture_output=True)
-    (wheel,) = wheels.iterdir()
-
-    (line,) = [run for run in image.runs if "pip install" in run]
-    options = shlex.split(line.split("pip install ")[1])
-    assert options[-1] == "/source"
-    options = [word.replace("/source", str(source)) for word in options[:-1]]
-    (pip,) = (Path(ensurepip.__file__).parent / "_bundled").glob("pip-*.whl")
-    offline = ["--no-index", "--no-deps", "--no-compile", "--target", str(target)]
-    subprocess.run(
-        [sys.executable, f"{pip}/pip", "install", *options, *offline, str(wheel)],
-        check=True, capture_output=True, env={**os.environ, "PIP_ROOT_USER_ACTION": "ignore"},
-    )  # fmt: skip
-    assert (target / "vram_arbiter/configs/containers/compose.yaml").exists()
-    with zipfile.ZipFile(wheel) as archive:
-        (entry_points,) = [n for n in archive.namelist() if n.endswith("entry_points.txt")]
-        assert "vram-arbiter = vram_arbiter.arbiter" in archive.read(entry_points).decode()
 
 
 # -- the arbiter as PID 1

@@ -1,5 +1,6 @@
 """Code on the pages is true: commands and flags exist in the programs' parsers, Python compiles and
-imports what exists, YAML is what our models accept, JSON is JSON. The site is built of these pages.
+imports what exists, YAML is what our models accept, JSON is JSON. The site is built of these pages,
+at night and by `make docs`.
 """
 
 import argparse
@@ -268,6 +269,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.heavy
+@pytest.mark.nightly
 def test_the_site_is_built_without_a_warning_and_needs_no_other_host(site: Path) -> None:
     loaded = re.compile(
         r"<(?:script|img|iframe)[^>]+src=\"(?:https?:)?//[^\"]*|"
@@ -279,6 +281,7 @@ def test_the_site_is_built_without_a_warning_and_needs_no_other_host(site: Path)
 
 
 @pytest.mark.heavy
+@pytest.mark.nightly
 def test_the_search_index_is_small(site: Path) -> None:
     """A browser loads and builds it at the first search: 700 kB took it half a second."""
     assert (site / "search/search_index.json").stat().st_size < 550_000
@@ -325,6 +328,7 @@ def test_texts_of_the_site_have_the_contrast_of_wcag_aa(scheme: str) -> None:
 
 
 @pytest.mark.heavy
+@pytest.mark.nightly
 def test_the_reference_has_every_command_key_and_error(site: Path) -> None:
     for program, parser in programs().items():
         text = (site / f"reference/cli/{program}.html").read_text(encoding="utf-8")

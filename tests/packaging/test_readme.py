@@ -1,7 +1,9 @@
 """README.md does what it says: its commands are typed in a fresh clone with an installed product,
 its example runs as printed.
 
-`readme.sh` alone types all of them; what installs, trains or takes minutes is left out here.
+`readme.sh` alone types all of them; what installs, trains or takes minutes is left out here. Every
+run of the tests types those of the base install; a robot's and the tutorial's are typed at night:
+`test_page_blocks.py` parses them, and `tests/examples` and `tests/runner` run what they run.
 """
 
 import os
@@ -89,6 +91,7 @@ def test_the_commands_of_the_base_install_work(reader: Reader) -> None:
     assert "Traceback" not in printed
 
 
+@pytest.mark.nightly
 def test_the_commands_of_the_tutorial_work(reader: Reader) -> None:
     printed = reader.types(skip=INSTALLS, page="docs/tutorial/first-leases.md")
     assert "detector is held again, with 1 weights" in printed
@@ -104,6 +107,7 @@ def test_each_sidecar_of_the_page_has_a_shipped_model() -> None:
 
 
 @pytest.mark.heavy
+@pytest.mark.nightly
 def test_the_commands_with_a_robot_work(reader: Reader) -> None:
     """One sidecar is started: each imports for 8 s of a core."""
     skip = f"{INSTALLS}|{LONG}|{OTHER_SIDECARS}|^vramctl "

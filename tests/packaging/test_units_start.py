@@ -3,7 +3,7 @@ back.
 
 Installed, upgraded and removed by `vramctl` as docs/how-to/systemd.md says. The units once never
 started: a system call filter ended the daemon before its first line. Reading the files did not show
-that.
+that. The arbiter's unit is tried in every run of the tests, the others at night.
 """
 
 import json
@@ -204,6 +204,7 @@ hooks:
 """
 
 
+@pytest.mark.nightly
 def test_hooks_run_as_their_page_says(machine: Machine) -> None:
     """They hear of what happened while they were stopped, and may look, not act."""
     copied, started, _ = (step.partition("#")[0] for step in steps("Service", "hooks.md"))
@@ -260,6 +261,7 @@ def test_a_mistake_in_the_configuration_is_not_tried_again(machine: Machine) -> 
     machine.start(ARBITER)
 
 
+@pytest.mark.nightly
 def test_the_unit_of_a_user_starts_in_the_manager_of_a_user(machine: Machine) -> None:
     """Such a manager has no privileges: a setting that drops capabilities keeps a unit from
     starting there."""
@@ -298,6 +300,7 @@ printf 'Host: 127.0.0.1:%s\r\nConnection: close\r\n\r\n' $1 >&3
 cat <&3"""
 
 
+@pytest.mark.nightly
 def test_setup_puts_a_unit_under_a_lease_which_stops_and_starts_it(machine: Machine) -> None:
     """A model server that runs is found, adopted with its bytes, stopped by an eviction, and
     started by a request. Its processes are no descendants of the lease's holder."""
@@ -420,6 +423,7 @@ def tokens_inside(machine: Machine) -> dict[str, list[int] | None]:
     return {name: lease["token"] for name, lease in (leases_inside(machine) or {}).items()}
 
 
+@pytest.mark.nightly
 def test_an_upgrade_keeps_leases_and_files_of_the_operator(machine: Machine) -> None:
     edited = f"{SYSTEM}/vram-sidecar@.service"
     machine.write(edited, machine.read(edited) + "# of the operator\n")
@@ -446,6 +450,8 @@ def test_an_upgrade_keeps_leases_and_files_of_the_operator(machine: Machine) -> 
 
 
 def test_a_removal_leaves_nothing_behind(machine: Machine, before: set[str]) -> None:
+    edited = f"{SYSTEM}/vram-sidecar@.service"
+    machine.write(edited, machine.read(edited) + "# of the operator\n")
     said = machine.run("vramctl", "uninstall", "--yes")
     assert f"{SYSTEM}/vram-sidecar@.service: changed by hand" in said
     kept = {line.split()[0].strip("/") for line in files_inside(machine) - before}

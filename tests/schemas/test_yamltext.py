@@ -112,11 +112,8 @@ def test_a_key_is_the_text_that_stands_in_the_file() -> None:
     assert [found.line((key,)) for key in texts][:4] == [1, 2, 3, 4]
 
 
-@pytest.mark.parametrize(
-    "path", sorted((ROOT / "configs").rglob("*.yaml")), ids=lambda path: path.name
-)
-def test_every_shipped_file_is_read(path: Path) -> None:
-    assert read_yaml(path).data
+def test_every_shipped_file_is_read() -> None:
+    assert all(read_yaml(path).data for path in (ROOT / "configs").rglob("*.yaml"))
 
 
 def test_a_file_that_cannot_be_read_is_a_typed_error(tmp_path: Path) -> None:

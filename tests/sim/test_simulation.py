@@ -1,5 +1,5 @@
-"""The whole arbiter under faults, a few seeds of it; `make sim SEEDS=1000` runs more, `make sim
-SEED=n` one again."""
+"""The whole arbiter under faults: two seeds in every run of the tests, a few more at night; `make
+sim SEEDS=1000` runs many, `make sim SEED=n` one again."""
 
 import asyncio
 import contextlib
@@ -28,7 +28,9 @@ first_report = functools.cache(run_seed)
 A, B, GPU = ProcessKey(1, 1), ProcessKey(2, 2), GpuId("GPU-0")
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "seed", [0, 2, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 3, 4, 5))]
+)
 def test_nothing_that_must_hold_breaks_under_faults(seed: int) -> None:
     report = first_report(seed)
     assert not report.failure, report.failure
@@ -37,13 +39,13 @@ def test_nothing_that_must_hold_breaks_under_faults(seed: int) -> None:
 
 
 def test_waiters_give_up_while_holders_are_revoked_for_them() -> None:
-    reports = [first_report(seed) for seed in (2, 4)]
-    assert all(report.notes["revoke_withdrawn"] for report in reports)
-    assert all(report.faults["wait_ended_for_a_revoked_holder"] for report in reports)
+    report = first_report(2)
+    assert report.notes["revoke_withdrawn"]
+    assert report.faults["wait_ended_for_a_revoked_holder"]
 
 
 def test_a_seed_replays_exactly() -> None:
-    assert run_seed(0).digest == first_report(0).digest != first_report(1).digest
+    assert run_seed(0).digest == first_report(0).digest != first_report(2).digest
 
 
 def test_sums_over_runs_name_the_seeds_that_failed() -> None:

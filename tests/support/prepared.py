@@ -114,6 +114,7 @@ PROGRAMS: Mapping[str, Program] = {
     "deploy-nod": Program("tests.runner.deploy_nod", server="vram-runner"),
     "neighbour": Program("tests.e2e.neighbour", CLIENT),
     "stepper": Program("tests.e2e.stepper", server="neighbour"),
+    "script": Program("tests.support.script", server="vramctl"),
     "storm-worker": Program("tests.chaos.worker", CLIENT),
     "op-server": Program("tests.support.server_process", server="echo"),
     "dataset-writer": Program("tests.support.dataset_writer", server="vram-sidecar"),

@@ -1,6 +1,7 @@
 """Words for every code that the engine can say. No type checker sees into the templates."""
 
 from dataclasses import replace
+from itertools import product
 
 import pytest
 from hypothesis import given, settings
@@ -60,25 +61,16 @@ def test_every_explanation_has_words(told: Explanation) -> None:
     assert text in words.error_view(r.TimedOut("det", 1.0, told)).message
 
 
-@pytest.mark.parametrize("code", Condition)
-def test_every_condition_has_words(code: Condition) -> None:
-    blocker = Blocker("L1-1", "det", 1, "held", 0, code, by="{g}", pid=7)
-    assert explained.condition(blocker)
-
-
-@pytest.mark.parametrize("code", Block)
-def test_every_block_has_words(code: Block) -> None:
-    assert explained.block(BlockView(code, ("{det}",)))
-
-
-@pytest.mark.parametrize("action", NextAction)
-@pytest.mark.parametrize("because", Because)
-def test_every_step_has_words(action: NextAction, because: Because) -> None:
-    step = Step(action, "{det}", "L1-1", 1.0, because, waiter="{w}")
-    assert explained.step_words(step)
-
-
-def test_every_wait_has_words() -> None:
+def test_every_code_has_words() -> None:
+    for code in Condition:
+        assert explained.condition(Blocker("L1-1", "det", 1, "held", 0, code, by="{g}", pid=7)), (
+            code
+        )
+    for block in Block:
+        assert explained.block(BlockView(block, ("{det}",))), block
+    for action, because in product(NextAction, Because):
+        step = Step(action, "{det}", "L1-1", 1.0, because, waiter="{w}")
+        assert explained.step_words(step), step
     assert explained.WAIT.keys() == set(Wait)
 
 

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,9 +16,9 @@ from typing import Any
 
 import pytest
 
-from tests.sidecars import echo_sidecar
-from tests.support.paths import CONFIGS
+from tests.support.paths import CONFIGS, ROOT
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import until
 from vram_arbiter.arbiter.host.gpu.fake import make_gpu
 from vram_arbiter.clients.calibration import entry as entries
 from vram_arbiter.clients.calibration import model
@@ -303,7 +304,7 @@ def test_a_model_in_a_sidecar_of_its_own(gpu: Gpu, readings: Path, fake_folder: 
     (fake_folder / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(slow))
     (readings / "rskill.yaml").write_text(MANIFEST)
     sidecar = [
-        sys.executable, str(echo_sidecar.__file__), str(readings), "--name", "calibrate",
+        sys.executable, f"{ROOT}/tests/sidecars/echo_sidecar.py", str(readings), "--name", "calibrate",
         "--no-arbiter", "--device", gpu.device, "--rskill", str(readings / "rskill.yaml"),
         "--footprint", "1200MiB,1GiB,300MiB",
     ]  # fmt: skip
@@ -377,28 +378,19 @@ def test_a_robot_goes_first(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     """A request of a higher priority ends the calibration and its program."""
-    waiting = subprocess.Popen(
-        [sys.executable, "-c", REQUEST, arbiter_daemon.endpoint, str(readings)],
-        stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    program = "import sys, pathlib, signal; pathlib.Path(sys.argv[1], 'up').touch(); signal.pause()"
-    assert calibrate("--", sys.executable, "-c", program, str(readings)) == 1
+
+    def robot() -> bool:
+        until((readings / "up").exists)
+        with Client("robot", endpoint=arbiter_daemon.endpoint) as client:
+            client.acquire(vram="1GiB", priority=60, wait_timeout_s=PATIENCE_S).release()
+        return True
+
+    program = 'touch "$1"; exec sleep 1000'
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(robot)
+        assert calibrate("--", "sh", "-c", program, "sh", str(readings / "up")) == 1
+        assert waiting.result(PATIENCE_S)
     assert "the GPU is needed" in capfd.readouterr().err
-    assert waiting.communicate(timeout=PATIENCE_S)[0] == "granted\n"
-
-
-REQUEST = """
-import sys, time
-from pathlib import Path
-from vram_arbiter.clients.sidecar.perception import DetectorClient
-from vram_arbiter.clients.sidecar.policy import PolicyClient
-from vram_arbiter.clients.sync import Client
-
-while not Path(sys.argv[2], "up").exists():
-    time.sleep(0.005)
-with Client("robot", endpoint=sys.argv[1]) as client, client.lease(vram="1GiB", priority=60):
-    print("granted", flush=True)
-"""
 
 
 @pytest.mark.e2e

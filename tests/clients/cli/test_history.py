@@ -3,25 +3,22 @@
 import argparse
 import datetime
 import json
-import queue
 import shutil
 import signal
-import subprocess
-import sys
-import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 
 import pytest
 
 from tests.support.process import ArbiterProcess, vramctl
+from tests.support.running import Running, running
 from vram_arbiter.clients.cli import history
 from vram_arbiter.clients.cli.history import Wanted, collect, since
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.wire.requests import History
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
-PATIENCE_S = 60.0
 NOON = datetime.datetime(2026, 11, 21, 12, 0).timestamp()
 
 
@@ -150,6 +147,11 @@ def test_folded_events_are_counted_and_do_not_fill_the_limit(
     assert count == "(3999 quiet events not shown: --all)"
 
 
+def following(arbiter: ArbiterProcess, kind: str) -> AbstractContextManager[Running]:
+    words = ("history", "--follow", "--kind", kind, "--json")
+    return running("vramctl", words, arbiter.environ)
+
+
 @pytest.mark.e2e
 def test_following_shows_the_past_and_then_the_present(
     arbiter_daemon: ArbiterProcess, spec: Callable[..., LeaseSpec]
@@ -166,36 +168,11 @@ def test_following_shows_the_past_and_then_the_present(
         assert kinds == ["granted", "ready", "switch"]
         assert vramctl("history", "--since", "soon", environ=arbiter_daemon.environ).returncode == 2
 
-        process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "vram_arbiter.clients",
-                "history",
-                "--follow",
-                "--kind",
-                "granted",
-                "--json",
-            ],
-            env=arbiter_daemon.environ,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        try:
-            lines: queue.Queue[str] = queue.Queue()
-            output = process.stdout
-            assert output is not None
-            threading.Thread(
-                target=lambda: [lines.put(line) for line in output], daemon=True
-            ).start()
-            assert json.loads(lines.get(timeout=PATIENCE_S))["consumer"] == "early"
+        with following(arbiter_daemon, "granted") as run:
+            assert json.loads(run.line())["consumer"] == "early"
             client.acquire(spec("late", 1)).ready()
-            assert json.loads(lines.get(timeout=PATIENCE_S))["consumer"] == "late"
-            process.send_signal(signal.SIGINT)
-            assert process.wait(PATIENCE_S) in (0, 130)
-        finally:
-            process.kill()
-            process.wait()
+            assert json.loads(run.line())["consumer"] == "late"
+            assert run.ended(signal.SIGINT) in (0, 130)
 
 
 @pytest.mark.e2e
@@ -206,32 +183,12 @@ def test_following_goes_on_after_a_restart_with_a_new_history(
     arbiter = make_arbiter().start()
     for _ in range(3):
         assert vramctl("drain", "-r", "x", environ=arbiter.environ).returncode == 0
-    process = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "vram_arbiter.clients",
-            "history",
-            "--follow",
-            "--kind",
-            "operator",
-            "--json",
-        ],
-        env=arbiter.environ,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        output = process.stdout
-        assert output is not None
-        assert [json.loads(output.readline())["action"] for _ in range(3)] == ["drain"] * 3
+    with following(arbiter, "operator") as run:
+        assert [json.loads(run.line())["action"] for _ in range(3)] == ["drain"] * 3
         arbiter.stop()
         for path in arbiter.state.glob("*"):
             path.unlink() if path.is_file() else shutil.rmtree(path)
         arbiter.start()
         # perhaps before the follower is back
         assert vramctl("drain", "-r", "after", environ=arbiter.environ).returncode == 0
-        assert json.loads(output.readline())["reason"] == "after"
-    finally:
-        process.kill()
-        process.wait()
+        assert json.loads(run.line())["reason"] == "after"

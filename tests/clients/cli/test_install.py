@@ -303,10 +303,10 @@ def owner_only(found: os.stat_result) -> str:
 
 
 # -- completion
-@pytest.mark.parametrize("name", [name for name in COMMANDS if not COMMANDS[name].passes_on])
-def test_no_help_shows_an_escaped_percent_sign(name: str) -> None:
+def test_no_help_shows_an_escaped_percent_sign() -> None:
     """argparse reads `%%` in the help of an argument, and leaves it in a description."""
-    assert "%%" not in command_parser(name).format_help()
+    names = [name for name, command in COMMANDS.items() if not command.passes_on]
+    assert [name for name in names if "%%" in command_parser(name).format_help()] == []
 
 
 def test_completion_knows_every_command_and_its_options(

@@ -1,7 +1,6 @@
 """`vramctl run` as a program: what it starts, passes on and measures, and what ends its program."""
 
 import asyncio
-import contextlib
 import fcntl
 import json
 import os
@@ -11,13 +10,15 @@ import signal
 import subprocess
 import sys
 import termios
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
 
 from tests.support.leases import view_of
 from tests.support.process import ArbiterProcess, vramctl
+from tests.support.running import Running, running
 from vram_arbiter.clients import cuda
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.program import Program
@@ -27,7 +28,6 @@ from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 Spec = Callable[..., LeaseSpec]
-Finished = subprocess.CompletedProcess[str]
 PATIENCE_S = 60.0
 PROGRAM = """
 import signal, sys
@@ -46,43 +46,23 @@ DEAF = (
 )
 
 
-def command(*options: str, program: str = PROGRAM) -> list[str]:
-    run = [
-        sys.executable,
-        "-m",
-        "vram_arbiter.clients",
-        "run",
-        "--vram",
-        "5GiB",
-        "--name",
-        "job",
-        *options,
-    ]
-    return [*run, "--", sys.executable, "-c", program]
+RUN = ("run", "--vram", "5GiB", "--name")
 
 
-@contextlib.contextmanager
-def running(
-    environ: dict[str, str], *options: str, program: str = PROGRAM
-) -> Iterator["subprocess.Popen[str]"]:
-    """A program under `vramctl run`, once it is up."""
-    process = subprocess.Popen(
-        command(*options, program=program),
-        env=environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "up\n"
-        yield process
-    finally:
-        if process.poll() is None:
-            process.terminate()  # passed on to the program
-        process.communicate(timeout=PATIENCE_S)
+def job(
+    environ: Mapping[str, str], *options: str, name: str = "job", program: str = PROGRAM
+) -> AbstractContextManager[Running]:
+    """A program under `vramctl run`."""
+    words = (*RUN, name, *options, "--", sys.executable, "-c", program)
+    return running("vramctl", words, environ)
 
 
-def error_line(process: "subprocess.Popen[str]") -> str:
-    assert process.stderr is not None
-    return process.stderr.readline()
+@contextmanager
+def up(environ: Mapping[str, str], *options: str, program: str = PROGRAM) -> Iterator[Running]:
+    """One that prints when it is up, and is."""
+    with job(environ, *options, program=program) as run:
+        assert run.line() == "up"
+        yield run
 
 
 # -- the program
@@ -178,20 +158,17 @@ def test_a_program_may_have_any_name(arbiter_daemon: ArbiterProcess, tmp_path: P
 def test_run_passes_signals_on(
     number: signal.Signals, code: int, arbiter_daemon: ArbiterProcess
 ) -> None:
-    with running(arbiter_daemon.environ) as process:
-        process.send_signal(number)
-        assert process.wait(PATIENCE_S) == code
+    with up(arbiter_daemon.environ) as run:
+        assert run.ended(number) == code
 
 
 @pytest.mark.e2e
 def test_an_interrupt_by_another_process_is_passed_on(arbiter_daemon: ArbiterProcess) -> None:
     """`kill -INT` of `vramctl` reached nothing: its program was left to run."""
-    with running(arbiter_daemon.environ) as process:
-        process.send_signal(signal.SIGINT)
-        assert process.stdout is not None
-        assert process.stdout.readline() == "int\n"
-        process.terminate()
-        assert process.wait(PATIENCE_S) == 6
+    with up(arbiter_daemon.environ) as run:
+        run.process.send_signal(signal.SIGINT)
+        assert run.line() == "int"
+        assert run.ended(signal.SIGTERM) == 6
 
 
 @pytest.mark.e2e
@@ -202,8 +179,10 @@ def test_the_terminals_interrupt_reaches_the_program_once(arbiter_daemon: Arbite
     attributes = termios.tcgetattr(slave)
     attributes[3] &= ~termios.ECHO
     termios.tcsetattr(slave, termios.TCSANOW, attributes)
+    words = (*RUN, "job", "--", sys.executable, "-c", PROGRAM)
     process = subprocess.Popen(
-        command(), env=arbiter_daemon.environ, stdin=slave, stdout=subprocess.PIPE, text=True,
+        [sys.executable, "-m", "vram_arbiter.clients", *words],
+        env=arbiter_daemon.environ, stdin=slave, stdout=subprocess.PIPE, text=True,
         start_new_session=True, preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
     )  # fmt: skip
     try:
@@ -227,25 +206,24 @@ def test_two_programs_that_do_not_fit_together_run_one_after_the_other(
     options: tuple[str, ...], client: Client, arbiter_daemon: ArbiterProcess
 ) -> None:
     """The second was denied at once, because the first was pinned."""
-    with running(arbiter_daemon.environ, *options) as first:
-        second = subprocess.Popen(
-            command("--name", "next", "--wait", "60", program="raise SystemExit(4)"),
-            env=arbiter_daemon.environ, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        assert "waiting: " in error_line(second)
+    environ = arbiter_daemon.environ
+    last = "raise SystemExit(4)"
+    with (
+        up(environ, *options) as first,
+        job(environ, "--wait", "60", name="next", program=last) as second,
+    ):
+        second.said("waiting: ")
         if not options:
-            assert "next waits for its room (priority 40)" in error_line(first)
-        assert (view_of(client, "job").uses, first.poll()) == (1, None)
-        first.terminate()
-        assert first.wait(PATIENCE_S) == 5
-    assert second.wait(PATIENCE_S) == 4
-    second.communicate()
+            first.said("next waits for its room (priority 40)")
+        assert (view_of(client, "job").uses, first.process.poll()) == (1, None)
+        assert first.ended(signal.SIGTERM) == 5
+        assert second.ended() == 4
 
 
 @pytest.mark.e2e
 def test_a_program_waits_for_as_long_as_it_was_told(arbiter_daemon: ArbiterProcess) -> None:
     """`--wait` did not count beside a pinned program: the answer was no at once."""
-    with running(arbiter_daemon.environ, "--pin"):
+    with up(arbiter_daemon.environ, "--pin"):
         done = vramctl(
             "run", "--vram", "5GiB", "--wait", "0.2", "true", environ=arbiter_daemon.environ
         )
@@ -258,16 +236,14 @@ def test_a_higher_priority_behind_an_equal_one_ends_the_program(
     client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
     """The revoke was for the first of them, and no second one comes."""
-    with running(arbiter_daemon.environ) as process:
-        equal = subprocess.Popen(
-            command("--name", "next", program="pass"), env=arbiter_daemon.environ
-        )
-        assert "next waits" in error_line(process)
+    environ = arbiter_daemon.environ
+    with up(environ) as run, job(environ, name="next", program="pass") as equal:
+        run.said("next waits")
         lease = client.acquire(spec("b", 5), PATIENCE_S)
-        assert process.wait(PATIENCE_S) == 5
-        assert "b needs the room; ending it" in error_line(process)
-    lease.release()
-    assert equal.wait(PATIENCE_S) == 0
+        assert run.ended() == 5
+        run.said("b needs the room; ending it")
+        lease.release()
+        assert equal.ended() == 0
 
 
 @pytest.mark.e2e
@@ -275,36 +251,33 @@ def test_an_operator_ends_the_program_although_it_keeps_another_waiting(
     arbiter_daemon: ArbiterProcess,
 ) -> None:
     environ = arbiter_daemon.environ
-    with running(environ) as process:
-        equal = subprocess.Popen(command("--name", "next", program="pass"), env=environ)
-        assert "next waits" in error_line(process)
+    with up(environ) as run, job(environ, name="next", program="pass") as equal:
+        run.said("next waits")
         assert vramctl("evict", "job", "--reason", "lunch", environ=environ).returncode == 0
-        assert process.wait(PATIENCE_S) == 5
-        assert "lunch; ending it" in error_line(process)
-    assert equal.wait(PATIENCE_S) == 0
+        assert run.ended() == 5
+        run.said("lunch; ending it")
+        assert equal.ended() == 0
 
 
 @pytest.mark.e2e
 def test_a_program_that_does_not_end_in_its_grace_is_killed(
     client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    with running(arbiter_daemon.environ, "--grace", "0.1", program=DEAF) as process:
-        lease = client.acquire(spec("b", 5), PATIENCE_S)
-        assert process.wait(PATIENCE_S) == 128 + signal.SIGKILL
-    lease.release()
+    with up(arbiter_daemon.environ, "--grace", "0.1", program=DEAF) as run:
+        client.acquire(spec("b", 5), PATIENCE_S)
+        assert run.ended() == 128 + signal.SIGKILL
 
 
 @pytest.mark.e2e
 def test_run_is_pinned_only_on_request(
     client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
 ) -> None:
-    with running(arbiter_daemon.environ, "--pin"):
+    with up(arbiter_daemon.environ, "--pin"):
         assert view_of(client, "job").evictable is False
-    with running(arbiter_daemon.environ, "--priority", "60", "--on-revoke", "term") as process:
+    with up(arbiter_daemon.environ, "--priority", "60", "--on-revoke", "term") as run:
         assert view_of(client, "job").evictable is True
-        lease = client.acquire(spec("b", 5), PATIENCE_S)
-        assert process.wait(PATIENCE_S) == 5
-    lease.release()
+        client.acquire(spec("b", 5), PATIENCE_S)
+        assert run.ended() == 5
 
 
 # -- what it measured

@@ -4,20 +4,19 @@ simulated GPU, and stand-ins for model servers."""
 import contextlib
 import itertools
 import os
-import select
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
 
 from tests.support.leases import view_of
-from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess, vramctl
 from tests.support.processes import alive
+from tests.support.running import Running, running
 from tests.support.waiting import until
 from vram_arbiter.clients.cli.run import check_gpus
 from vram_arbiter.clients.sync import Client
@@ -41,49 +40,10 @@ HOST = f"127.{1 + _PID // 65536 % 250}.{_PID // 256 % 256}.{1 + _PID % 250}"
 PORTS = itertools.count(20000)
 
 
-class Running:
-    """`vramctl run` of a program, and what both print."""
-
-    def __init__(self, process: Forked, output: int, errors: int) -> None:
-        self.process = process
-        self._pipes = {output: b"", errors: b""}
-        self._output, self._errors = output, errors
-
-    def line(self) -> str:
-        """The next line of the program."""
-        return self._until(self._output, b"\n")
-
-    def said(self, words: str) -> str:
-        """What `vramctl` printed up to these words."""
-        return self._until(self._errors, words.encode())
-
-    def _until(self, pipe: int, end: bytes) -> str:
-        deadline = time.monotonic() + PATIENCE_S
-        while end not in self._pipes[pipe]:
-            left = max(0.0, deadline - time.monotonic())
-            data = os.read(pipe, 4096) if select.select([pipe], [], [], left)[0] else b""
-            if not data:
-                raise TimeoutError(f"no {end!r} after {self._pipes}")
-            self._pipes[pipe] += data
-        text, self._pipes[pipe] = self._pipes[pipe].split(end, 1)
-        return text.decode()
-
-
-@contextlib.contextmanager
-def running(arbiter: ArbiterProcess, *arguments: str) -> Iterator[Running]:
-    output, out = os.pipe()
-    errors, err = os.pipe()
-    words = ["run", "--vram", "5GiB", "--name", "job", *arguments]
-    process = start("vramctl", words, arbiter.environ, out, err)
-    os.close(out)
-    os.close(err)
-    try:
-        yield Running(process, output, errors)
-    finally:
-        process.kill()
-        process.wait(PATIENCE_S)
-        os.close(output)
-        os.close(errors)
+def job(arbiter: ArbiterProcess, *arguments: str) -> AbstractContextManager[Running]:
+    """`vramctl run` of a program."""
+    words = ("run", "--vram", "5GiB", "--name", "job", *arguments)
+    return running("vramctl", words, arbiter.environ)
 
 
 @contextlib.contextmanager
@@ -94,7 +54,7 @@ def server(
     port = str(next(PORTS))
     command = [*SERVER, str(arbiter.gpu_folder), str(4 << 30), HOST, port, *broken]
     urls = [option.replace("URL", f"http://{HOST}:{port}") for option in options]
-    with running(arbiter, "--on-evict", action, *urls, "--", *command) as run:
+    with job(arbiter, "--on-evict", action, *urls, "--", *command) as run:
         yield run, int(run.line())
 
 
@@ -110,7 +70,7 @@ def test_a_stopped_program_is_started_again(
 ) -> None:
     """Its child does not end with it, and is ended too: it could hold the memory."""
     program = [sys.executable, "-c", PROGRAM]
-    with running(arbiter_daemon, "--on-evict", "stop", "--", *program) as run:
+    with job(arbiter_daemon, "--on-evict", "stop", "--", *program) as run:
         first, orphan = map(int, run.line().split())
         lease = client.acquire(spec("b", 5), PATIENCE_S)
         run.said("ending it")
@@ -124,8 +84,8 @@ def test_a_stopped_program_is_started_again(
         until(lambda: view_of(client, "job").state == "held")
         lease = client.acquire(spec("b", 5), PATIENCE_S)
         assert not alive(second)
-        run.process.send_signal(signal.SIGTERM)  # nothing runs that could take it
-        assert run.process.wait(PATIENCE_S) == 128 + signal.SIGTERM
+        # nothing runs that could take it
+        assert run.ended(signal.SIGTERM) == 128 + signal.SIGTERM
     until(lambda: [lease.consumer for lease in client.status().leases] == ["b"])
 
 
@@ -139,7 +99,7 @@ def test_a_stopped_program_that_ends_by_itself_ends_vramctl(arbiter_daemon: Arbi
 
 def test_a_program_does_not_outlive_a_killed_vramctl(arbiter_daemon: ArbiterProcess) -> None:
     """Regression: it went on without a lease, and a suspended one would have stayed for ever."""
-    with running(arbiter_daemon, "--", "sh", "-c", "echo $$; exec sleep 1000") as run:
+    with job(arbiter_daemon, "--", "sh", "-c", "echo $$; exec sleep 1000") as run:
         program = int(run.line())
         run.process.kill()
         until(lambda: not alive(program))
@@ -168,8 +128,7 @@ def test_a_server_frees_its_memory_and_takes_it_back(
         assert "lunch" in run.said("freeing by vllm")
         run.said("restored")  # an operator's evict is no reason to stay away
         assert alive(pid)
-        run.process.send_signal(signal.SIGTERM)
-        assert run.process.wait(PATIENCE_S) == 0
+        assert run.ended(signal.SIGTERM) == 0
 
 
 def test_without_host_ram_a_server_that_needs_it_is_stopped(
@@ -210,8 +169,7 @@ def test_memory_that_a_server_does_not_free_is_not_granted(
 
         until(explained)
         assert (alive(pid), waiting.done()) == (True, False)
-        run.process.send_signal(signal.SIGTERM)
-        assert run.process.wait(PATIENCE_S) == 0
+        assert run.ended(signal.SIGTERM) == 0
         waiting.result(PATIENCE_S).release()
 
 
@@ -225,8 +183,7 @@ def test_a_restore_that_fails_gives_the_lease_back_and_keeps_the_program(
         assert "/restore: answered 500: broken" in told
         until(lambda: not client.status().leases)
         assert alive(pid)
-        run.process.send_signal(signal.SIGTERM)
-        assert run.process.wait(PATIENCE_S) == 0
+        assert run.ended(signal.SIGTERM) == 0
 
 
 # -- options

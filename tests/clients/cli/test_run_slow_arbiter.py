@@ -2,10 +2,8 @@
 neither cut off from its signals nor left alone."""
 
 import asyncio
-import contextlib
 import os
 import signal
-import subprocess
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -13,36 +11,25 @@ from contextlib import asynccontextmanager
 import pytest
 
 from tests.support.grants_at_once import GrantsAtOnce
+from tests.support.running import Running, running
 from vram_arbiter.schemas.errors import LeaseLost
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
 WAIT_S = 60.0
 PROGRAM = (
-    "import os, signal, sys; signal.signal(15, lambda *_: sys.exit(5)); print(os.getpid(), "
-    "flush=True); signal.pause()"
+    "import signal, sys; signal.signal(15, lambda *_: sys.exit(5)); print('up', flush=True); "
+    "signal.pause()"
 )
 
 
 @asynccontextmanager
-async def vramctl_run(endpoint: str) -> AsyncIterator[asyncio.subprocess.Process]:
+async def vramctl_run(endpoint: str) -> AsyncIterator[Running]:
     """A program that ends with 5 on SIGTERM, once it is up."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "vram_arbiter.clients", "run", "--vram", "1GiB", "--name", "job",
-        "--", sys.executable, "-c", PROGRAM,
-        env={**os.environ, "VRAM_ARBITER_ENDPOINT": endpoint}, stdout=subprocess.PIPE,
-    )  # fmt: skip
-    assert process.stdout is not None
-    program = os.pidfd_open(int(await process.stdout.readline()))
-    try:
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            signal.pidfd_send_signal(program, signal.SIGKILL)
-        os.close(program)
-        if process.returncode is None:
-            process.kill()
-            await process.wait()
+    words = ("run", "--vram", "1GiB", "--name", "job", "--", sys.executable, "-c", PROGRAM)
+    with running("vramctl", words, {**os.environ, "VRAM_ARBITER_ENDPOINT": endpoint}) as run:
+        assert await asyncio.to_thread(run.line) == "up"
+        yield run
 
 
 async def test_a_signal_reaches_the_program_although_the_arbiter_has_not_heard_that_it_runs() -> (
@@ -54,10 +41,9 @@ async def test_a_signal_reaches_the_program_although_the_arbiter_has_not_heard_t
     async with (
         asyncio.timeout(WAIT_S),
         arbiter.serving() as endpoint,
-        vramctl_run(endpoint) as process,
+        vramctl_run(endpoint) as run,
     ):
-        process.send_signal(signal.SIGTERM)
-        assert await process.wait() == 5
+        assert await asyncio.to_thread(run.ended, signal.SIGTERM) == 5
     assert arbiter.heard[-2:] == ["release", "bye"]
 
 
@@ -68,8 +54,7 @@ async def test_a_program_whose_lease_is_gone_when_it_has_started_is_waited_for()
     async with (
         asyncio.timeout(WAIT_S),
         arbiter.serving() as endpoint,
-        vramctl_run(endpoint) as process,
+        vramctl_run(endpoint) as run,
     ):
         await arbiter.refused.wait()
-        process.send_signal(signal.SIGTERM)
-        assert await process.wait() == 5
+        assert await asyncio.to_thread(run.ended, signal.SIGTERM) == 5

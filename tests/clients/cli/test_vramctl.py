@@ -66,51 +66,45 @@ def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) ->
         assert word in done.stdout
 
 
-EVERY_COMMAND = (
-    "status", "why", "history", "top",
-    "evict", "pin", "unpin", "drain", "resume", "release-dead", "run", "doctor",
-    "mcp", "replay", "demo",
-)  # fmt: skip
+COMMANDS = {
+    "clients": (
+        "", "status", "why", "history", "top", "evict", "pin", "unpin", "drain", "resume",
+        "release-dead", "run", "doctor", "mcp", "replay", "demo",
+    ),
+    "runner": ("", "sim", "deploy", "estop"),
+    "arbiter": ("",), "arbiter.offline": ("replay",), "sidecars": ("",), "reasoner": ("",),
+    "schemas": ("", "check"),
+}  # fmt: skip
+RUN_EACH = """
+import contextlib, io, json, runpy, sys
+said = {}
+for line in json.loads(sys.argv[1]):
+    sys.argv, out = line, io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+        runpy.run_module(line[0], run_name='__main__')
+    said[' '.join(line)] = out.getvalue()
+print(json.dumps(said))
+"""
 
 
-@pytest.mark.parametrize("flag", ["-h", "--version"])
-def test_every_program_and_command_has_it(flag: str, nowhere: dict[str, str]) -> None:
+def test_every_program_and_command_has_help_and_version(nowhere: dict[str, str]) -> None:
     """`vramctl -h` was wrong usage, and only the daemon had `--version`."""
-    program = (
-        "import contextlib, io, json, runpy, sys\n"
-        "said = {}\n"
-        "for line in json.loads(sys.argv[1]):\n"
-        "    sys.argv, out = line, io.StringIO()\n"
-        "    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):\n"
-        "        runpy.run_module(line[0], run_name='__main__')\n"
-        "    said[' '.join(line)] = out.getvalue()\n"
-        "print(json.dumps(said))\n"
-    )
     lines = [
-        ["vram_arbiter.clients", flag],
-        *(["vram_arbiter.clients", command, flag] for command in EVERY_COMMAND),
-    ]
-    lines += [
-        ["vram_arbiter.runner", flag],
-        *(["vram_arbiter.runner", command, flag] for command in ("sim", "deploy", "estop")),
-    ]
-    lines += [
-        [f"vram_arbiter.{name}", flag] for name in ("arbiter", "sidecars", "reasoner", "schemas")
-    ]
-    lines += [
-        ["vram_arbiter.schemas", "check", flag],
-        ["vram_arbiter.arbiter.offline", "replay", flag],
+        [f"vram_arbiter.{program}", *filter(None, [command]), flag]
+        for program, commands in COMMANDS.items()
+        for command in commands
+        for flag in ("-h", "--version")
     ]
     done = subprocess.run(
-        [sys.executable, "-c", program, json.dumps(lines)],
+        [sys.executable, "-c", RUN_EACH, json.dumps(lines)],
         env=nowhere, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    wanted = "vram-arbiter " if flag == "--version" else "sage: "
-    through_a_program = {f"vram_arbiter.clients replay {flag}"}
+    wanted = {"-h": "sage: ", "--version": "vram-arbiter "}
+    through_a_program = "vram_arbiter.clients replay "
     wrong = {
         line: said for line, said in json.loads(done.stdout.splitlines()[-1]).items()
-        if wanted not in said and line not in through_a_program
+        if wanted[line.split()[-1]] not in said and not line.startswith(through_a_program)
     }  # fmt: skip
     assert wrong == {}
 

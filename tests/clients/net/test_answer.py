@@ -5,8 +5,6 @@ import asyncio
 import itertools
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -17,7 +15,7 @@ from typing import Any
 import pytest
 
 from tests.support import protocol_wire
-from tests.support.paths import ROOT
+from tests.support.running import running
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.answer import Answer
 from vram_arbiter.clients.net.server import Peer, RouterServer
@@ -200,18 +198,10 @@ def test_an_answer_that_came_while_the_process_was_stopped_counts(
         os.kill(peer.pid, signal.SIGCONT)
 
     endpoint = serve_answer(stop, go_on)
-    child = subprocess.Popen(
-        [sys.executable, "-c", CLIENT, endpoint],
-        env={**os.environ, "PYTHONPATH": f"{ROOT}/src"},
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        out, err = child.communicate(timeout=PATIENCE_S)
-    finally:
-        child.kill()
-        child.wait()
-    assert (out, child.returncode) == ("here\n", 0), err
-    assert stopped == [child.pid]
+    with running("script", [CLIENT, endpoint], os.environ) as child:
+        assert child.line() == "here"
+        assert child.ended() == 0
+    assert stopped == [child.process.pid]
 
 
 def test_silence_is_silence() -> None:

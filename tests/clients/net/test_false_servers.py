@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.paths import SUPPORT
-from tests.support.process import ArbiterProcess
+from tests.support.process import ArbiterProcess, vramctl
 from vram_arbiter.clients.cli.replies import UNREACHABLE
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net import request
@@ -139,12 +139,7 @@ def test_vramctl_says_who_serves_there(short_folder: Path) -> None:
     environ = {**os.environ, "VRAM_ARBITER_ENDPOINT": f"ipc://{short_folder}/s"}
     with false_server(short_folder, "s") as heard:
         for command in (["status"], ["status", "--json"], ["resume"], ["history", "-f"]):
-            done = subprocess.run(
-                [sys.executable, "-m", "vram_arbiter.clients", *command],
-                env=environ,
-                capture_output=True,
-                text=True,
-            )
+            done = vramctl(*command, environ=environ)
             assert done.returncode == UNREACHABLE, done
             if "--json" in command:
                 assert json.loads(done.stdout)["error"]["code"] == "untrusted_server"

@@ -15,7 +15,7 @@ if not all(find_spec(name) for name in ("starlette", "uvicorn", "httpx", "promet
 @pytest.fixture(scope="session")
 def busy() -> CoreDriver:
     """A run of the engine with a bit of everything; read only."""
-    return busy_driver(7)
+    return busy_driver(7, steps=50)
 
 
 @pytest.fixture

@@ -6,8 +6,6 @@ import os
 import re
 import signal
 import socket
-import subprocess
-import sys
 import uuid
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -16,6 +14,7 @@ import pytest
 
 from tests.support.collector import Collector, ReceivedSpan
 from tests.support.observer import ObserverProcess
+from tests.support.prepared import run
 from tests.support.process import ArbiterProcess
 from tests.support.processes import children
 from tests.support.status_page import EventStream, get, port_of
@@ -286,14 +285,8 @@ NAMES = ("detector", "policy")
 def test_what_the_environment_gets_wrong_ends_the_start(
     arbiter_daemon: ArbiterProcess, environ: dict[str, str], words: str
 ) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "vram_arbiter.clients.observer", "--http", "127.0.0.1:0"],
-        env={**arbiter_daemon.environ, **environ},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    environ = {**arbiter_daemon.environ, **environ}
+    done = run("vram-observer", ["--http", "127.0.0.1:0"], environ, 60.0)
     assert done.returncode == 2
     assert words in done.stderr
     assert "Traceback" not in done.stderr

@@ -40,28 +40,15 @@ def warned(text: str) -> object:
     return parse_manifest(text).warnings()
 
 
-READERS: dict[str, tuple[Reader, list[str]]] = {
-    "manifest": (
-        warned,
-        [
-            path.read_text(encoding="utf-8")
-            for path in sorted(ROOT.glob("configs/rskills/*/rskill.yaml"))
-        ],
-    ),
-    "robot": (
-        lambda text: load_robot(text, "robot.yaml"),
-        [
-            ROBOT,
-            *(
-                path.read_text(encoding="utf-8")
-                for path in sorted(ROOT.glob("configs/robots/*.yaml"))
-            ),
-        ],
-    ),
-    "daemon": (
-        lambda text: load_config(text, "arbiter.yaml"),
-        [(ROOT / "configs/arbiter.yaml").read_text(encoding="utf-8")],
-    ),
+READERS: dict[str, Reader] = {
+    "manifest": warned,
+    "robot": lambda text: load_robot(text, "robot.yaml"),
+    "daemon": lambda text: load_config(text, "arbiter.yaml"),
+}
+PATHS = {
+    "manifest": "configs/rskills/*/rskill.yaml",
+    "robot": "configs/robots/*.yaml",
+    "daemon": "configs/arbiter.yaml",
 }
 
 
@@ -102,23 +89,32 @@ def yaml_text(value: Any, place: tuple[Any, ...], raw: str, at: tuple[Any, ...] 
     return json.dumps(value)
 
 
-CASES = [
-    (name, document, place)
-    for name, (_, texts) in READERS.items()
-    for document in map(yaml.safe_load, texts)
-    for place in places(document)
-]
+def cases() -> st.SearchStrategy[tuple[str, Any, tuple[Any, ...]]]:
+    """A reader, a file of its kind, and a place in that."""
+    texts = {
+        name: [path.read_text(encoding="utf-8") for path in sorted(ROOT.glob(pattern))]
+        for name, pattern in PATHS.items()
+    }
+    texts["robot"].append(ROBOT)
+    return st.sampled_from(
+        [
+            (name, document, place)
+            for name, found in texts.items()
+            for document in map(yaml.safe_load, found)
+            for place in places(document)
+        ]
+    )
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(case=st.sampled_from(CASES), raw=st.sampled_from(VALUES))
+@given(case=st.deferred(cases), raw=st.sampled_from(VALUES))
 def test_any_value_at_any_key_is_read_or_found_fault_with(
     case: tuple[str, Any, tuple[Any, ...]], raw: str
 ) -> None:
     """Regression: `model_family: []` ended in a TypeError."""
     name, document, place = case
     try:
-        READERS[name][0](yaml_text(document, place, raw))
+        READERS[name](yaml_text(document, place, raw))
     except (ConfigError, ManifestError):
         pass
 

@@ -74,28 +74,24 @@ RECORDED: list[tuple[w.AnyRequest, dict[str, Any]]] = [
 ]
 
 
-@pytest.mark.parametrize(("request_", "recorded"), RECORDED)
-def test_a_request_is_sent_and_read_as_ever(
-    request_: w.AnyRequest, recorded: dict[str, Any]
-) -> None:
-    frame = msgpack.packb({**recorded, "id": 7})
-    assert msgpack.packb({**to_map(request_), "id": 7}) == frame
-    assert decode(frame, MESSAGE_MAX_BYTES) == (w.Envelope(RequestId(7)), request_)
+def test_a_request_is_sent_and_read_as_ever() -> None:
+    for request, recorded in RECORDED:
+        frame = msgpack.packb({**recorded, "id": 7})
+        assert msgpack.packb({**to_map(request), "id": 7}) == frame
+        assert decode(frame, MESSAGE_MAX_BYTES) == (w.Envelope(RequestId(7)), request)
 
 
 def test_every_op_is_recorded() -> None:
     assert {type(request) for request, _ in RECORDED} == set(w.REQUESTS.values())
 
 
-@pytest.mark.parametrize(("request_", "recorded"), RECORDED)
-def test_what_older_clients_leave_out_is_its_default(
-    request_: w.AnyRequest, recorded: dict[str, Any]
-) -> None:
+def test_what_older_clients_leave_out_is_its_default() -> None:
     """A client need not say a field that has a default, nor its version a newer one's field."""
-    optional = {field.name for field in fields(request_) if field.default is not MISSING}
-    short = {key: value for key, value in recorded.items() if key not in optional}
-    _, read = decode(msgpack.packb({**short, "id": 7}), MESSAGE_MAX_BYTES)
-    assert read == from_map(type(request_), short)
+    for request, recorded in RECORDED:
+        optional = {field.name for field in fields(request) if field.default is not MISSING}
+        short = {key: value for key, value in recorded.items() if key not in optional}
+        _, read = decode(msgpack.packb({**short, "id": 7}), MESSAGE_MAX_BYTES)
+        assert read == from_map(type(request), short)
 
 
 @pytest.mark.parametrize("op", ["renew", "reattach"])

@@ -108,11 +108,11 @@ def test_an_event_matches(
     assert matched(hook(**fields), event) == name
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_there_is_a_sample_of_every_event(name: str) -> None:
-    one = hook(on=name)
-    made = sample(one, name)
-    assert matched(one, made.event) == name
+def test_there_is_a_sample_of_every_event() -> None:
+    hooks = {name: hook(on=name) for name in NAMES}
+    assert {name: matched(one, sample(one, name).event) for name, one in hooks.items()} == {
+        name: name for name in NAMES
+    }
 
 
 def test_variables_hold_the_plain_values() -> None:
