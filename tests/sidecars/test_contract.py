@@ -68,6 +68,7 @@ KINDS = (
         "detector", "rskills/so101-detector",
         lambda: {"op": "detect", "image": red(), "query": "red cube"},
         lambda: {"op": "detect", "image": b"\x89PNG no picture", "query": "red cube"},
+        slow=True,
     ),
     Kind(
         "scene-vlm", "rskills/so101-scene-vlm",

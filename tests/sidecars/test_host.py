@@ -3,7 +3,6 @@ ended."""
 
 import json
 import os
-import select
 import signal
 from pathlib import Path
 from time import monotonic
@@ -288,17 +287,6 @@ def test_after_a_killed_keeper_the_model_is_read_before_a_lease_is_asked_for(box
     assert leases(arbiter) == {}
     (sidecar.folder / "slow_prepare").unlink()
     assert sidecar.client.reply(waiting, PATIENCE_S)["ok"]
-
-
-def test_a_model_dies_with_its_host(box):
-    sidecar = box.start("detector")
-    sidecar.detect()
-    sidecar.hold()
-    model = os.pidfd_open(sidecar.model_pid())
-    sidecar.process.kill()
-    assert select.select([model], [], [], PATIENCE_S)[0], "also in the middle of its work"
-    os.close(model)
-    until(lambda: box.used() == 0)
 
 
 def test_torch_is_not_imported_where_no_tensor_is(box):

@@ -221,18 +221,13 @@ async def test_the_keeper_may_die_and_the_next_one_begins_anew(place: Place) -> 
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize(
-    "libraries",
-    [("torch",), pytest.param(("torch", "transformers", LEROBOT), marks=pytest.mark.nightly)],
-)
-async def test_the_keeper_has_one_thread_and_no_device_before_each_fork(
-    place: Place, libraries: tuple[str, ...]
-) -> None:
+@pytest.mark.nightly  # it imports torch and lerobot once more
+async def test_the_keeper_has_one_thread_and_no_device_before_each_fork(place: Place) -> None:
     """A fork copies one thread only: locks that others hold would stay locked. A CUDA context does
     not survive a fork at all. The weights are in host RAM once, whatever is forked."""
     forkserver._forkserver._stop()  # type: ignore[attr-defined]  # the next one imports these
     processes = place.processes(adapter=functools.partial(matrix_for, MATRIX_BYTES))
-    processes.preload(libraries)
+    processes.preload(("torch", "transformers", LEROBOT))
     async with asyncio.timeout(4 * WAIT_S):
         assert await processes.load() == GB, "the weights stand for those of a production model"
         answers = []

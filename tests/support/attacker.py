@@ -70,8 +70,8 @@ def more(path: str) -> None:
 
 
 def connects(path: str) -> None:
-    """Connections that say nothing, as many as this process may have; those that are cut are made
-    again.
+    """Connections that say nothing, up to a thousand a second and as many as this process may have;
+    those that are cut are made again.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, CONNECTIONS_MAX + 64), hard))
@@ -90,7 +90,7 @@ def connects(path: str) -> None:
                 under_way()
             cut = set(select_closed(peers))
             peers = [one for one in peers if one not in cut]
-            time.sleep(0.001)
+        time.sleep(0.001)
 
 
 def select_closed(peers: list[socket.socket]) -> list[socket.socket]:

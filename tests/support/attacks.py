@@ -8,6 +8,7 @@ pointed at anything but a server that the caller started.
 
 import contextlib
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterator
 from itertools import cycle
@@ -185,3 +186,10 @@ ATTACKS: dict[str, Callable[[str, float], None]] = {
     )
 }
 """By name: `attack(path, end_s)` goes on until `time.monotonic()` is `end_s`."""
+
+
+def main() -> None:
+    """Attack as `ATTACK SOCKET SECONDS` on the command line say; print a line before."""
+    name, path, seconds = sys.argv[1:]
+    print("attacking", flush=True)
+    ATTACKS[name](path, time.monotonic() + float(seconds))

@@ -1,5 +1,5 @@
-"""`vram-gateway` whose children `vramctl run` are forked from a process that has imported them
-(`prepared`): each would import for 0.7 s of a core.
+"""`vram-gateway` whose children `vramctl run` are forked from a process that has imported them and
+the servers that they start (`run_program`): each would import for 0.7 s of a core.
 """
 
 import asyncio
@@ -35,7 +35,7 @@ async def _start(
     printed, prints = os.pipe()
     with open(prints, "wb"):  # closed here once the child has it
         forked = await asyncio.to_thread(
-            start, "vramctl", arguments, env, prints, prints, passed=pass_fds,
+            start, "vramctl-run", arguments, env, prints, prints, passed=pass_fds,
             session=start_new_session,
         )  # fmt: skip
     reader = asyncio.StreamReader()

@@ -56,6 +56,8 @@ class Program:
 CLIENT = ("anyio._backends._asyncio", "vram_arbiter.clients.client")
 SIDECAR = (
     "anyio._backends._asyncio",
+    "multiprocessing.popen_forkserver",
+    "vram_arbiter.sidecars.device.fake",
     "vram_arbiter.sidecars.host",
     "vram_arbiter.sidecars.model_main",
 )
@@ -63,9 +65,11 @@ PROGRAMS: Mapping[str, Program] = {
     "vram-arbiter": Program(
         "vram_arbiter.arbiter.__main__",
         (
+            "email.parser",  # for its version
             "vram_arbiter.arbiter.daemon",
             "vram_arbiter.arbiter.host.process",
             "vram_arbiter.arbiter.log",
+            "vram_arbiter.schemas.runtime.heap",
         ),
     ),
     "vramctl": Program(
@@ -81,6 +85,7 @@ PROGRAMS: Mapping[str, Program] = {
             "vram_arbiter.clients.cli.why",
         ),
     ),
+    "vramctl-run": Program("tests.support.run_program", (*CLIENT, "vram_arbiter.clients.cli.run")),
     "vram-observer": Program(
         "vram_arbiter.clients.observer.__main__",
         ("anyio._backends._asyncio", "vram_arbiter.clients.observer.program"),
@@ -97,7 +102,12 @@ PROGRAMS: Mapping[str, Program] = {
     "episode": Program("tests.e2e.episode_sidecar", (*SIDECAR, "numpy"), forks=True),
     "vram-sidecar": Program(
         "vram_arbiter.sidecars.__main__",
-        (*SIDECAR, "transformers", "vram_arbiter.sidecars.preload_lerobot"),
+        (
+            *SIDECAR,
+            "transformers",
+            "vram_arbiter.sidecars.preload_lerobot",
+            "vram_arbiter.sidecars.models.compact_act",
+        ),
         forks=True,
     ),
     "vram-runner": Program(
@@ -105,7 +115,10 @@ PROGRAMS: Mapping[str, Program] = {
         (
             "anyio._backends._asyncio",
             "cv2",
+            "mujoco.egl",
             "numpy",
+            "vram_arbiter.runner.robots.so101_mujoco",
+            "vram_arbiter.runner.sensors.opencv_thread",
             *(f"vram_arbiter.runner.cli.{name}" for name in ("deploy", "deployment", "sim")),
             "vram_arbiter.runner.sim.env",
         ),
@@ -115,6 +128,7 @@ PROGRAMS: Mapping[str, Program] = {
     "neighbour": Program("tests.e2e.neighbour", CLIENT),
     "stepper": Program("tests.e2e.stepper", server="neighbour"),
     "script": Program("tests.support.script", server="vramctl"),
+    "attacker": Program("tests.support.attacks", server="neighbour"),
     "storm-worker": Program("tests.chaos.worker", CLIENT),
     "op-server": Program("tests.support.server_process", server="echo"),
     "dataset-writer": Program("tests.support.dataset_writer", server="vram-sidecar"),

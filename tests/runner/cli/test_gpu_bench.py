@@ -28,7 +28,9 @@ from vram_arbiter.runner.sensors.platform import Platform
 from vram_arbiter.schemas.goals import ResultPush
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
+# each part has tests of its own: cameras of files, detectors, recorder, spans, the skill
 pytestmark = [
+    pytest.mark.nightly,
     pytest.mark.heavy,
     pytest.mark.e2e,
     pytest.mark.timeout(300),

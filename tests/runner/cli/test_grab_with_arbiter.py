@@ -19,7 +19,13 @@ from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
-pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(340)]
+# uses and a killed policy are in tests/e2e/test_episodes.py, this policy in test_deploy_grab.py
+pytestmark = [
+    pytest.mark.nightly,
+    pytest.mark.heavy,
+    pytest.mark.e2e,
+    pytest.mark.timeout(340),
+]
 
 NAVIGATE = "vram-arbiter/so101-navigate"
 

@@ -17,7 +17,7 @@ import pytest
 
 from tests.runner.skills.policy_bench import Arbiter, Sidecar
 from tests.runner.small_robots import FedCamera
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, eventually, until
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.runner.__main__ import parse
@@ -122,12 +122,20 @@ class Bench:
         self.bus.put(6, PRESENT, round(4095 * (rest["gripper"] - low) / (high - low)))
 
     async def until_at(self, name: str, angle_rad: float) -> None:
-        while abs(self.parts.hal.sent().get(name, 9.0) - angle_rad) > 0.01:
-            await asyncio.sleep(0.01)
+        await eventually(lambda: abs(self.parts.hal.sent().get(name, 9.0) - angle_rad) <= 0.01)
+
+    async def until_asked(self, times: int) -> None:
+        """Until the policy was."""
+        await eventually(lambda: len(self.sidecar.observations) >= times)
+
+    async def five_ticks_more(self) -> None:
+        wanted = len(self.ticks.ticks) + 5
+        await eventually(lambda: len(self.ticks.ticks) >= wanted)
 
     async def until_phase(self, phase: str) -> None:
-        while (await self.client.state())["phase"] != phase:
-            await asyncio.sleep(0.01)
+        async with asyncio.timeout(PATIENCE_S):
+            while (await self.client.state())["phase"] != phase:
+                await asyncio.sleep(0.01)
 
 
 def parts_of(bus: ServoBus, folder: Path, **transport: Any) -> Parts:
@@ -230,7 +238,8 @@ async def test_a_leader_that_is_unplugged_makes_the_arm_hold_and_then_fails_the_
     rig.bus.mend()
     step = len(rig.ticks.ticks)
     goal = await rig.client.send_goal(NAME)
-    await rig.until_at("shoulder_pan", 0.1)  # on its way to where the leader is by now
+    # on its way to where the leader is by now
+    await eventually(lambda: rig.parts.hal.sent().get("shoulder_pan", 0.0) >= 0.1)
     sag = 0.01  # between the last target and where the arm stands, from which it begins
     assert rig.ticks.longest_step(step - 1) <= ALIGN_RAD_S / RATE_HZ + sag
     await goal.cancel()
@@ -241,8 +250,7 @@ async def test_an_operator_who_pushes_against_a_limit_does_not_fail_the_goal(rig
     goal = await rig.client.send_goal(NAME)
     await rig.until_at("shoulder_pan", 0.0)
     rig.parts.gate._memory.tripped = "a wall"
-    while sum(not tick.result.action_applied for tick in rig.ticks.ticks) < 30:
-        await asyncio.sleep(0.01)
+    await eventually(lambda: sum(not tick.result.action_applied for tick in rig.ticks.ticks) >= 30)
     rig.parts.gate._memory.tripped = ""
     rig.lead("shoulder_pan", 0.1)
     await rig.until_at("shoulder_pan", 0.1)
@@ -254,8 +262,7 @@ async def test_a_take_over_ends_the_policys_use_and_gives_back_to_a_fresh_one(
     rig: Bench,
 ) -> None:
     goal = await rig.client.send_goal("test/grab", prompt="grab it")
-    while len(rig.sidecar.observations) < 2:
-        await asyncio.sleep(0.01)
+    await rig.until_asked(2)
     assert (await rig.client.take_over("take"))["goal_id"] == goal.goal_id
     assert [use.ended for use in rig.arbiter.uses] == [1]
     asked = len(rig.sidecar.observations)
@@ -269,8 +276,7 @@ async def test_a_take_over_ends_the_policys_use_and_gives_back_to_a_fresh_one(
     back = len(rig.ticks.ticks)
     await rig.client.take_over("give_back")
     await rig.until_phase("running")
-    while len(rig.sidecar.observations) == asked:
-        await asyncio.sleep(0.01)
+    await rig.until_asked(asked + 1)
     assert rig.sidecar.calls[before : before + 3] == ["load", "reset", "get_action"]
     fresh = rig.sidecar.observations[asked]["observation.state"]
     assert fresh[0] == pytest.approx(0.3, abs=0.15)  # the servo lags; the start pose has 0
@@ -302,8 +308,7 @@ async def test_a_dead_leader_takes_nothing_over(rig: Bench) -> None:
     with pytest.raises(RobotFault, match="does not answer"):
         await rig.client.take_over("take")
     asked = len(rig.sidecar.observations)
-    while len(rig.sidecar.observations) < asked + 2:  # the policy goes on
-        await asyncio.sleep(0.01)
+    await rig.until_asked(asked + 2)  # the policy goes on
     for do in ("give_back", "end"):
         with pytest.raises(BadState, match="does not have the robot"):
             await rig.client.take_over(do)  # type: ignore[arg-type]
@@ -334,9 +339,7 @@ async def test_demonstrations_and_take_overs_are_rows_that_lerobot_reads(
         recording = asyncio.create_task(args.run(args))
         for number, verdict in enumerate(("k", "d", "k")):
             os.write(write, b"\n")
-            ticks = len(rig.ticks.ticks)
-            while len(rig.ticks.ticks) < ticks + 5:
-                await asyncio.sleep(0.01)
+            await rig.five_ticks_more()
             os.write(write, f"\n{verdict}\n".encode())
             while recorder.counts.episodes + recorder.counts.discarded <= number:
                 await asyncio.sleep(0.01)
@@ -345,15 +348,12 @@ async def test_demonstrations_and_take_overs_are_rows_that_lerobot_reads(
         assert "2 of 2 episodes are kept" in capsys.readouterr().out
 
         goal = await rig.client.send_goal("test/grab", prompt="grab it")
-        while len(rig.sidecar.observations) < 2:
-            await asyncio.sleep(0.01)
+        await rig.until_asked(2)
         assert parse(["takeover"]).do == "take"
         for do in ("take", "give-back"):
             args = parse(["takeover", do, "--endpoint", rig.client.endpoint])
             assert await args.run(args) == 0
-            ticks = len(rig.ticks.ticks)
-            while len(rig.ticks.ticks) < ticks + 5:
-                await asyncio.sleep(0.01)
+            await rig.five_ticks_more()
         await rig.until_phase("running")
         await goal.cancel()
         await goal.result(60)

@@ -7,7 +7,6 @@ import asyncio
 import json
 import os
 import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,6 +20,7 @@ from hypothesis import strategies as st
 
 from tests.runner.conftest import KinematicEnv, world_of
 from tests.runner.manual_clock import ManualClock
+from tests.support import prepared
 from vram_arbiter.runner.__main__ import main
 from vram_arbiter.runner.cli import lerobot_eval
 from vram_arbiter.runner.cli.benchmark import add_parser, entries_of
@@ -388,22 +388,23 @@ def test_two_cells_of_one_name_do_not_overwrite_each_others_videos(
 @pytest.mark.e2e
 def test_a_signal_ends_it_with_a_report_of_what_was_played(tmp_path: Path) -> None:
     argv = [
-        *(sys.executable, "-m", "vram_arbiter.runner", "benchmark", "--policy", "random"),
-        *("--no-videos", "--max-steps", "2", "--episodes", "1000000", "--out", str(tmp_path)),
+        *("benchmark", "--policy", "random", "--no-videos", "--max-steps", "2"),
+        *("--episodes", "1000000", "--out", str(tmp_path)),
     ]
-    process = subprocess.Popen(argv, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    said, says = os.pipe()
+    with (tmp_path / "printed").open("wb") as printed:
+        process = prepared.start("vram-runner", argv, os.environ, printed.fileno(), says, cwd=ROOT)
+    os.close(says)
     try:
-        assert process.stderr is not None
-        while b"seed 3:" not in (line := process.stderr.readline()):
-            assert line, "it ended by itself"
-        process.send_signal(signal.SIGTERM)
-        out, _ = process.communicate(timeout=60)
+        with open(said) as errors:
+            while "seed 3:" not in (line := errors.readline()):
+                assert line, "it ended by itself"
+            process.terminate()
+            errors.read()
+        assert process.wait(60) == 1
     finally:
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
-    assert process.returncode == 1
-    assert b"not complete: stopped" in out
+        process.kill()
+    assert "not complete: stopped" in (tmp_path / "printed").read_text()
     written = report(tmp_path)
     assert (written["complete"], written["cells"][0]["complete"]) == (False, False)
     assert written["cells"][0]["played"] >= 4

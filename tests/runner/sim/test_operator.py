@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("mujoco")
+if find_spec("mujoco") is None:
+    pytest.skip("needs the full install", allow_module_level=True)
 pytest.importorskip("lerobot", reason="needs the sidecars extra")
 
 from tests.support.operated import play_program

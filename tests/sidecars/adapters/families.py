@@ -1,6 +1,7 @@
 """Policy families for tests: manifests, observations, answers, and lerobot's own loop."""
 
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,16 @@ from vram_arbiter.sidecars.weights import Weights, read_config
 
 SAVERS = policies.SAVERS | backbone_policies.SAVERS
 NAMES = tuple(SAVERS)
-BY_DAY = ("pi05", "smolvla", "diffusion")  # whose checkpoints are damaged in a usual run
+BY_DAY = ("act", "diffusion", "smolvla", "pi05")
+"""A chunk, a history, a small and a large VLA: what each sweep plays in a usual run."""
 SEED = 2  # most policies draw their actions
+
+
+def swept(names: Iterable[str] = NAMES) -> list[Any]:
+    """Return the parameters of a sweep: `make nightly` plays those that are not of BY_DAY."""
+    return [
+        pytest.param(name, marks=() if name in BY_DAY else pytest.mark.nightly) for name in names
+    ]
 
 
 def family_of(name: str) -> ModelFamily:

@@ -18,6 +18,13 @@ pytestmark = pytest.mark.heavy
 BLOCK = "actions: [detect]\ndetector: {labels: [cube], score_threshold: 0.0}\n"
 LABELS = ["red cube", "ball"]
 WIDTH, HEIGHT = 80, 60
+BY_DAY = ("owlvit", "grounding_dino")
+"""`make nightly` plays the other families of each sweep, too."""
+
+
+def swept(*families):
+    night = pytest.mark.nightly
+    return [pytest.param(one, marks=() if one in BY_DAY else night) for one in families]
 
 
 @pytest.fixture
@@ -32,22 +39,18 @@ def load_detector(saved, manifest):
     return load_detector
 
 
-@pytest.mark.parametrize(
-    ("query", "labels"),
-    [
+def test_grounding_dino_takes_texts_with_a_dot(load_detector, png):
+    """Its processor joins texts by dots, and hands a list with a dot in it to the tokenizer as it
+    is: a TypeError, told as the model's failure."""
+    adapter, image = load_detector("grounding_dino"), png(WIDTH, HEIGHT)
+    for query, labels in (
         ("1.5 l bottle", {"1.5 l bottle"}),
         (["1.5 l bottle", "Ball"], {"1.5 l bottle", "Ball"}),
         ("red cube. blue ball.", {"red cube", "blue ball"}),
-    ],
-)
-def test_grounding_dino_takes_texts_with_a_dot(query, labels, load_detector, png):
-    """Its processor joins texts by dots, and hands a list with a dot in it to the tokenizer as it
-    is: a TypeError, told as the model's failure."""
-    reply = load_detector("grounding_dino").run(
-        DetectOp(op="detect", image=png(WIDTH, HEIGHT), query=query)
-    )
-    assert {one["label"] for one in reply["detections"]} <= labels
-    assert reply["detections"]
+    ):
+        reply = adapter.run(DetectOp(op="detect", image=image, query=query))
+        assert {one["label"] for one in reply["detections"]} <= labels
+        assert reply["detections"]
 
 
 def test_grounding_dino_reads_the_text_that_its_processor_would_write(load_detector, png):
@@ -64,16 +67,17 @@ def test_a_text_without_a_letter_is_refused(load_detector, png):
         load_detector("grounding_dino").run(call)
 
 
-@pytest.mark.parametrize(("size", "shrunk"), [((2000, 3), "1024 x 2"), ((3, 2000), "2 x 1024")])
-def test_a_picture_of_which_resizing_leaves_nothing_is_refused(size, shrunk, load_detector, png):
+def test_a_picture_of_which_resizing_leaves_nothing_is_refused(load_detector, png):
     """Resizing by the longer side leaves no pixel of the shorter one: the processor's ValueError
     was told as the model's failure."""
-    call = DetectOp(op="detect", image=png(*size), query=LABELS)
-    with pytest.raises(BadRequest, match=f"Processor cannot read pictures of {shrunk}: "):
-        load_detector("grounding_dino").run(call)
+    adapter = load_detector("grounding_dino")
+    for size, shrunk in (((2000, 3), "1024 x 2"), ((3, 2000), "2 x 1024")):
+        call = DetectOp(op="detect", image=png(*size), query=LABELS)
+        with pytest.raises(BadRequest, match=f"Processor cannot read pictures of {shrunk}: "):
+            adapter.run(call)
 
 
-@pytest.mark.parametrize("family", ["owlvit", "owlv2", "omdet_turbo"])
+@pytest.mark.parametrize("family", swept("owlvit", "owlv2", "omdet_turbo"))
 def test_a_picture_that_no_processor_resizes_is_not_passed_on(family, load_detector, png):
     """A checkpoint whose processor does not resize handed any size to a model of one size."""
     adapter = load_detector(family)
@@ -94,7 +98,7 @@ def detect(adapter, picture):
 
 
 @pytest.mark.parametrize("dtype", ["fp32", "bf16", "fp16"])
-@pytest.mark.parametrize("family", tiny_vision.DETECTORS)
+@pytest.mark.parametrize("family", swept(*tiny_vision.DETECTORS))
 def test_each_family_detects_in_each_precision(family, dtype, load_detector, manifest, png):
     """Grounding DINO raised in 16 bits: its inputs and its own tables are float32."""
     adapter = load_detector(family, dtype)
@@ -108,6 +112,7 @@ def test_each_family_detects_in_each_precision(family, dtype, load_detector, man
         assert detect(adapter, png(WIDTH, HEIGHT)) == found, "deterministic"
 
 
+@pytest.mark.nightly
 def test_omdet_turbo_with_a_backbone_of_timm(load_detector, manifest, png):
     pytest.importorskip("timm", reason="OmDet-Turbo's published backbone comes from timm")
     adapter = load_detector("omdet_timm", "fp16", tiny_vision.save_omdet_turbo_timm)

@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 
 from tests.sidecars.adapters.families import (
-    BY_DAY,
     NAMES,
     SEED,
     begin,
     history,
     load_policy,
     observations,
+    swept,
 )
 from tests.sidecars.adapters.policies import DIM, SIDE_PX, STATE, TASK
 from tests.support.waiting import play
@@ -31,14 +31,8 @@ from vram_arbiter.sidecars.wires import parse
 
 pytestmark = [pytest.mark.heavy, pytest.mark.usefixtures("small_networks")]
 
-AT_DOORS = [
-    pytest.param(name, marks=() if name in BY_DAY else pytest.mark.nightly)
-    for name in NAMES
-    if name != "lingbot_va"
-]
 
-
-@pytest.mark.parametrize("name", AT_DOORS)
+@pytest.mark.parametrize("name", swept(name for name in NAMES if name != "lingbot_va"))
 def test_a_family_is_served_at_lerobots_door(
     checkpoint: Callable[[str], Weights], name: str, short_folder: Path
 ) -> None:

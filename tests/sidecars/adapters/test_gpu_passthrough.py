@@ -1,11 +1,14 @@
 """Frames through the GPU: nothing moves, nothing is made up, no GPU is an error at the start."""
 
+import os
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.support import prepared
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.schemas.errors import BadRequest, ConfigError
 from vram_arbiter.schemas.manifest import load_manifest
 from vram_arbiter.schemas.sidecar import EndpointCall
@@ -116,20 +119,25 @@ def test_without_cameras_there_is_nothing_to_pass_on() -> None:
         GpuPassthroughAdapter(manifest)
 
 
+FLAGS = ("--name", "passthrough", "--rskill", str(RSKILL), "--no-arbiter")
+
+
 @pytest.mark.parametrize("device", ["none", "cuda"])
-def test_without_a_gpu_it_does_not_start(
-    device: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Regression: a program that called `main` kept the sidecar's folder as its temporary
-    folder."""
+def test_without_a_gpu_it_does_not_start(device: str, tmp_path: Path) -> None:
     import torch
 
     if device == "cuda" and torch.cuda.is_available():
         pytest.skip("this machine has a GPU")
+    flags = [*FLAGS, "--device", device, "--endpoint", f"ipc://{tmp_path}/passthrough.sock"]
+    done = prepared.run("vram-sidecar", flags, os.environ, PATIENCE_S)
+    assert done.returncode == 1
+    assert "GPU" in done.stderr
+    assert "fake:FOLDER" in done.stderr
+
+
+def test_a_program_that_calls_main_keeps_its_temporary_folder(tmp_path: Path) -> None:
+    """Regression: the sidecar's folder stayed that of the program."""
+    (tmp_path / "taken").mkdir()
     before = tempfile.gettempdir()
-    flags = ["--name", "passthrough", "--rskill", str(RSKILL), "--device", device, "--no-arbiter"]
-    assert main([*flags, "--endpoint", f"ipc://{tmp_path}/passthrough.sock"]) == 1
+    assert main([*FLAGS, "--device", "cuda", "--endpoint", f"ipc://{tmp_path}/taken"]) != 0
     assert tempfile.gettempdir() == before
-    said = capsys.readouterr().err
-    assert "GPU" in said
-    assert "fake:FOLDER" in said

@@ -1,7 +1,6 @@
 """Exported detectors through ONNX Runtime: tiny models that the tests make, with one box for each
 half of the picture, whose score for `red` and `blue` is that color in it."""
 
-import asyncio
 import json
 import os
 import subprocess
@@ -14,8 +13,9 @@ from typing import Any
 import pytest
 
 from tests.sidecars.conftest import MANIFEST
+from tests.support import prepared
 from tests.support.paths import ROOT
-from vram_arbiter.clients.sidecar.build import served
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.sidecar.perception import DetectorClient
 from vram_arbiter.schemas.errors import BadRequest, ConfigError, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest, parse_manifest
@@ -236,16 +236,19 @@ async def test_a_sidecar_serves_an_exported_detector() -> None:
         export(configs / "models/halves/model.onnx")
         manifest = manifest_of().model_copy(update={"weights_uri": "local://models/halves"})
         (configs / "rskill.yaml").write_text(json.dumps(manifest.model_dump(mode="json")))
-        command = [
-            sys.executable, "-m", "vram_arbiter.sidecars", "--name", "eye", "--no-arbiter",
-            "--rskill", f"{folder}/rskill.yaml", "--configs", folder, "--device", "none",
-            "--footprint", "1GB",
+        endpoint = f"ipc://{folder}/eye.sock"
+        words = [
+            "--name", "eye", "--no-arbiter", "--rskill", f"{folder}/rskill.yaml",
+            "--configs", folder, "--device", "none", "--footprint", "1GB",
+            "--endpoint", endpoint,
         ]  # fmt: skip
-        checking = await asyncio.create_subprocess_exec(
-            *command, "--check", env=os.environ | {"PYTHONPATH": f"{ROOT}/src"}
-        )
-        assert await checking.wait() == 0
-        client = DetectorClient(f"ipc://{folder}/eye.sock")
-        async with served(client, command):
-            (found,) = await client.detect(picture(), "red")
+        checked = prepared.run("vram-sidecar", [*words, "--check"], os.environ, PATIENCE_S)
+        assert checked.returncode == 0, checked.stdout
+        sidecar = prepared.start("vram-sidecar", words, os.environ)
+        try:
+            async with DetectorClient(endpoint, connect_timeout_s=PATIENCE_S) as client:
+                (found,) = await client.detect(picture(), "red")
             assert (found.label, found.box) == ("red", (0.0, 0.0, 40.0, 60.0))
+        finally:
+            sidecar.terminate()
+            assert sidecar.wait(PATIENCE_S) == 0

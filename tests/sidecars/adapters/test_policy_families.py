@@ -1,8 +1,8 @@
 """Every policy family that is served, loaded as in production, against lerobot itself.
 
 A tiny checkpoint of each family is saved by lerobot (`policies.py`); tools of these tests are in
-`families.py`. The reference is the robot's
-own loop in lerobot: preprocess, `select_action`, postprocess, at every control step.
+`families.py`. The reference is the robot's own loop in lerobot: preprocess, `select_action`,
+postprocess, at every control step. A usual run plays four families, `make nightly` all.
 """
 
 import json
@@ -15,7 +15,6 @@ import pytest
 
 from tests.sidecars.adapters import policies
 from tests.sidecars.adapters.families import (
-    BY_DAY,
     NAMES,
     SEED,
     ask,
@@ -32,6 +31,7 @@ from tests.sidecars.adapters.families import (
     prepared,
     served,
     stacked,
+    swept,
 )
 from tests.sidecars.adapters.policies import DIM, FRONT, ONLY_CAMERA, STATE
 from vram_arbiter.schemas.errors import (
@@ -62,7 +62,7 @@ NOT_SERVED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "lingbot_va"])
+@pytest.mark.parametrize("name", swept(name for name in NAMES if name != "lingbot_va"))
 def test_actions_are_lerobots_own(checkpoint: Callable[[str], Weights], name: str) -> None:
     """Regression: policies with an observation history loaded, passed `--check`, and failed at the
     first `get_action`. Then chunks were played whole where lerobot plays 3 of 5."""
@@ -91,7 +91,7 @@ MOST = {  # most actions of a chunk that may be played, and its length
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", MOST)
+@pytest.mark.parametrize("name", swept(MOST))
 def test_a_manifest_may_say_how_many_actions_are_played(
     checkpoint: Callable[[str], Weights], name: str
 ) -> None:
@@ -177,6 +177,7 @@ def test_a_call_afresh_depends_on_no_other_one(
     assert length == 1 or (afresh(steps[4]) != with_history).any(), "what it saw before counts"
 
 
+@pytest.mark.nightly
 def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]) -> None:
     """Its cache takes the observations after its own actions: one too few or too many, and all
     later actions would be others than lerobot's.
@@ -226,6 +227,7 @@ def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]
     assert meta == sizes
 
 
+@pytest.mark.nightly
 def test_lingbot_needs_its_encoders(checkpoint: Callable[[str], Weights], tmp_path: Path) -> None:
     """diffusers and transformers fill a gap in a checkpoint with random numbers."""
     from safetensors.torch import load_file, save_file
@@ -409,7 +411,7 @@ def test_weights_that_are_no_numbers_are_refused(
     is_refused(prepared(manifest_of("act"), weights), rf"1 with NaN or infinity \({key}\)")
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "act ensembling"])
+@pytest.mark.parametrize("name", swept(name for name in NAMES if name != "act ensembling"))
 def test_each_precision_of_the_table(checkpoint: Callable[[str], Weights], name: str) -> None:
     """The manifest's number format is the one that the weights have after loading."""
     import torch
@@ -432,7 +434,7 @@ def test_each_precision_of_the_table(checkpoint: Callable[[str], Weights], name:
             make_adapter(manifest_of(name, dtype), weights)
 
 
-@pytest.mark.parametrize("name", ["act", "tdmpc", "smolvla", "pi05"])
+@pytest.mark.parametrize("name", swept(["act", "tdmpc", "smolvla", "pi05"]))
 def test_linear_layers_in_nf4(checkpoint: Callable[[str], Weights], name: str) -> None:
     """int4 is NF4 as for every other model: chosen by the manifest, or refused, never bf16."""
     pytest.importorskip("bitsandbytes")
@@ -467,14 +469,7 @@ def test_a_quantized_layer_takes_the_numbers_of_autocast(tmp_path: Path, dtype: 
     assert ask(adapter, observations(1)[0]).shape == (3, DIM)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=() if name in BY_DAY else pytest.mark.nightly)
-        for name in NAMES
-        if not name.startswith("act")
-    ],
-)
+@pytest.mark.parametrize("name", swept(name for name in NAMES if not name.startswith("act")))
 def test_an_incomplete_policy_is_refused(
     checkpoint: Callable[[str], Weights], tmp_path: Path, name: str
 ) -> None:
@@ -571,10 +566,7 @@ def test_a_processor_runs_no_code_of_others(
     assert not touched.exists()
 
 
-GUIDED = ("smolvla", "pi05", "evo1")
-
-
-@pytest.mark.parametrize("name", GUIDED)
+@pytest.mark.parametrize("name", swept(["smolvla", "pi05", "evo1"]))
 def test_a_guided_chunk_continues_the_one_before(
     checkpoint: Callable[[str], Weights], name: str
 ) -> None:

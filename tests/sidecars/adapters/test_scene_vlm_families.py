@@ -21,8 +21,16 @@ RED, BLUE = (200, 30, 30), (30, 30, 200)
 needs_num2words = pytest.mark.skipif(
     find_spec("num2words") is None, reason="SmolVLM's processor writes numbers in words"
 )
+BY_DAY = ("qwen3_5", "smolvlm")
+"""`make nightly` plays the other families, too."""
 FAMILIES = [
-    pytest.param(family, marks=needs_num2words) if family == "smolvlm" else family
+    pytest.param(
+        family,
+        marks=[
+            *([] if family in BY_DAY else [pytest.mark.nightly]),
+            *([needs_num2words] if family == "smolvlm" else []),
+        ],
+    )
     for family in tiny_vision.VLMS
 ]
 

@@ -22,7 +22,9 @@ from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.adapters.scripted_pick import ScriptedPickAdapter
 from vram_arbiter.sidecars.weights import resolve
 
-pytest.importorskip("mujoco")
+if find_spec("mujoco") is None:
+    pytest.skip("needs the full install", allow_module_level=True)
+
 from tests.support.tabletop import NAMES, photo, run_expert
 from training import record_counter
 from vram_arbiter.runner.sim.env import SimEnv

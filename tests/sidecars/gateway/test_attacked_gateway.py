@@ -154,16 +154,15 @@ HEADS = {
 }
 
 
-@pytest.mark.parametrize("head", HEADS.values(), ids=HEADS)
-def test_a_request_that_can_be_read_two_ways_is_refused(
-    attacked: GatewayProcess, head: bytes
-) -> None:
+def test_a_request_that_can_be_read_two_ways_is_refused(attacked: GatewayProcess) -> None:
     """What follows it is not taken for another request."""
-    with connection_to(attacked) as peer:
-        peer.sendall(head + SMUGGLED)
-        peer.settimeout(PATIENCE_S)
-        came = answers(peer)
-    assert statuses(came) == [400], came
+    told = {}
+    for name, head in HEADS.items():
+        with connection_to(attacked) as peer:
+            peer.sendall(head + SMUGGLED)
+            peer.settimeout(PATIENCE_S)
+            told[name] = statuses(answers(peer))
+    assert told == {name: [400] for name in HEADS}
 
 
 @pytest.mark.parametrize(

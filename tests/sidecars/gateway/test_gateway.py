@@ -5,13 +5,11 @@ import contextlib
 import os
 import resource
 import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import httpx
-import openai
 import pytest
 
 pytest.importorskip("aiohttp", reason="the extra `gateway`")
@@ -21,6 +19,7 @@ import aiohttp
 from tests.sidecars.gateway.conftest import KEY, PATIENCE_S, GatewayProcess, stand_in
 from tests.support.collector import Collector
 from tests.support.leases import view_of
+from tests.support.prepared import start
 from tests.support.process import ArbiterProcess
 from tests.support.processes import alive, rss_bytes
 from tests.support.waiting import eventually
@@ -46,19 +45,21 @@ from vram_arbiter.sidecars.gateway.gateway import NAME
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 Start = Callable[..., GatewayProcess]
+SENT_BYTES = 1 << 26
 HELLO = [{"role": "user", "content": "hello"}]
 ANSWER = "0 1 "
 
 
-def openai_client(gateway: GatewayProcess, key: str = KEY) -> openai.AsyncOpenAI:
+def openai_client(gateway: GatewayProcess, key: str = KEY) -> Any:
+    import openai  # 1.6 s of a core, for each worker that collects this file
+
     return openai.AsyncOpenAI(
         base_url=f"{gateway.url}/v1", api_key=key, timeout=PATIENCE_S, max_retries=0
     )
 
 
-async def ask(client: openai.AsyncOpenAI, model: str, **fields: object) -> str:
-    chat: Any = client.chat.completions
-    answer = await chat.create(model=model, messages=HELLO, **fields)
+async def ask(client: Any, model: str, **fields: object) -> str:
+    answer = await client.chat.completions.create(model=model, messages=HELLO, **fields)
     return str(answer.choices[0].message.content)
 
 
@@ -89,7 +90,7 @@ async def test_the_first_request_starts_its_server_and_an_idle_one_leaves(
             assert [chunk.choices[0].delta.content async for chunk in stream] == ["0 ", "1 "]
         await eventually(lambda: set(started.running()) == {"b"})  # both fit; `a` was idle
         with Client("t", endpoint=arbiter_daemon.endpoint) as arbiter:
-            assert [lease.consumer for lease in arbiter.status().leases] == ["b"]
+            await eventually(lambda: [one.consumer for one in arbiter.status().leases] == ["b"])
         assert "a: serves on" in started.logs()
         started.close()
         asked = [
@@ -221,6 +222,8 @@ async def test_a_client_that_leaves_cancels_its_request_and_gives_up_its_place(
 async def test_a_request_that_does_not_end_is_ended_after_the_grace(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:
+    import openai
+
     started = gateway(
         {"a": stand_in(arbiter_daemon, 5, grace_s=0.2), "b": stand_in(arbiter_daemon, 5)}
     )
@@ -237,6 +240,8 @@ async def test_a_request_that_does_not_end_is_ended_after_the_grace(
 async def test_a_server_that_dies_says_why_and_is_started_again(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:
+    import openai
+
     started = gateway(
         {
             "a": stand_in(arbiter_daemon, 1),
@@ -268,6 +273,8 @@ async def test_a_server_that_dies_says_why_and_is_started_again(
 async def test_what_can_never_fit_is_said_in_the_arbiters_words(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:
+    import openai
+
     started = gateway({"a": stand_in(arbiter_daemon, 1), "b": stand_in(arbiter_daemon, 500)})
     async with openai_client(started) as client:
         with pytest.raises(openai.InternalServerError, match="500 GiB"):
@@ -299,24 +306,27 @@ async def test_a_killed_server_is_started_again(
 async def test_vramctl_run_listens_for_one_server_without_a_file(
     arbiter_daemon: ArbiterProcess,
 ) -> None:
+    import openai
+
     command = stand_in(arbiter_daemon, 1)["command"]
     flags = ["--vram", "1GiB", "--name", "llm", "--on-evict", "vllm", "--listen", "0"]
-    child = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "vram_arbiter.clients", "run", *flags, "--", *command,
-        env=arbiter_daemon.environ, stdout=asyncio.subprocess.PIPE,
-    )  # fmt: skip
-    assert child.stdout is not None
-    url = (await child.stdout.readline()).decode().strip()
+    said, says = os.pipe()
+    with open(said) as output:
+        child = start("vramctl-run", ["run", *flags, "--", *command], arbiter_daemon.environ, says)
+        os.close(says)
+        url = (await asyncio.to_thread(output.readline)).strip()
     async with openai.AsyncOpenAI(base_url=f"{url}/v1", api_key=KEY, max_retries=0) as client:
         assert await ask(client, "whatever") == ANSWER
     child.terminate()
-    assert await child.wait() == 0
+    assert await asyncio.to_thread(child.wait, PATIENCE_S) == 0
 
 
 # -- limits
 async def test_beyond_the_queue_and_the_wait_the_reason_is_said(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:
+    import openai
+
     started = gateway(
         {
             "a": stand_in(arbiter_daemon, 5),
@@ -385,6 +395,8 @@ async def test_the_reasoners_planner_asks_again_where_it_was_told_to_wait(
 async def test_keys_limit_who_may_use_what(
     gateway: Start, arbiter_daemon: ArbiterProcess, tmp_path: Path
 ) -> None:
+    import openai
+
     keys = tmp_path / "keys.yaml"
     keys.write_text("keys: [{name: ann, key: sk-0123456789abcdef, servers: [a]}]")
     keys.chmod(0o600)
@@ -440,7 +452,7 @@ async def test_a_slow_reader_does_not_fill_memory(
     before = rss_bytes(started.process.pid)
     async with (
         httpx.AsyncClient(timeout=PATIENCE_S) as client,
-        client.stream("GET", f"{started.url}/large?bytes={1 << 28}") as response,
+        client.stream("GET", f"{started.url}/large?bytes={SENT_BYTES}") as response,
     ):
         pieces = response.aiter_raw(65536)
         count = len(await anext(pieces))
@@ -449,7 +461,7 @@ async def test_a_slow_reader_does_not_fill_memory(
         assert rss_bytes(started.process.pid) - before < 32 << 20
         async for piece in pieces:
             count += len(piece)
-    assert count == 1 << 28
+    assert count == SENT_BYTES
 
 
 async def test_a_websocket_passes_and_does_not_keep_its_server(shared: GatewayProcess) -> None:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import openai
 import pytest
 
 pytest.importorskip("aiohttp", reason="the extra `gateway`")
@@ -22,7 +21,8 @@ from tests.support.tiny_gguf import write_gguf
 from tests.support.waiting import eventually
 from vram_arbiter.clients.sync import Client
 
-pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
+# test_gateway has the same with stand-ins
+pytestmark = [pytest.mark.anyio, pytest.mark.e2e, pytest.mark.nightly]
 HELLO = [{"role": "user", "content": "hello"}]
 WORDS = 2000
 """Of an answer that takes a second of a core: it is stopped at its first word."""
@@ -53,6 +53,8 @@ def servers(
 async def test_a_stock_client_talks_with_two_servers_in_room_for_one(
     servers: GatewayProcess, tmp_path: Path
 ) -> None:
+    import openai  # 1.6 s of a core, for each worker that collects this file
+
     async with openai.AsyncOpenAI(
         base_url=f"{servers.url}/v1", api_key=KEY, timeout=PATIENCE_S, max_retries=0
     ) as client:
@@ -80,9 +82,8 @@ async def test_a_stock_client_talks_with_two_servers_in_room_for_one(
         assert await other == 5
 
 
-async def _stream(client: openai.AsyncOpenAI, model: str, words: int) -> Any:
-    chat: Any = client.chat.completions
-    return await chat.create(
+async def _stream(client: Any, model: str, words: int) -> Any:
+    return await client.chat.completions.create(
         model=model,
         messages=HELLO,
         max_tokens=words,
@@ -92,7 +93,7 @@ async def _stream(client: openai.AsyncOpenAI, model: str, words: int) -> Any:
     )
 
 
-async def _chat(client: openai.AsyncOpenAI, model: str, words: int) -> int:
+async def _chat(client: Any, model: str, words: int) -> int:
     """Return the number of tokens of a whole answer."""
     chunks = [chunk async for chunk in await _stream(client, model, words)]
     return int(chunks[-1].usage.completion_tokens)

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vram_arbiter.schemas.errors import BadRequest
@@ -27,6 +27,7 @@ def fed(finder: Finder, body: bytes, size: int) -> int:
     return len(body)
 
 
+@settings(max_examples=40)
 @given(
     st.dictionaries(TEXT.filter(lambda key: key not in ("model", "stream")), VALUES, max_size=4),
     TEXT.filter(lambda name: 0 < len(name) <= 100),
