@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from tests.bench.harness import Suite, elapsed_us, p50, pause
-from tests.sidecars.doors.conftest import GRAB, KEY, Served, serving
+from tests.sidecars.doors.conftest import GRAB, KEY, Served, two_doors
 
 PERIOD_S = 0.1
 P99_MAX_US = 50_000.0
@@ -122,16 +122,16 @@ def begins(port: int) -> None:
 
 
 def sent(kind: type[Openpi] | type[Lerobot], *data: bytes) -> Callable[[int], None]:
-    """An attack: a connection of its own sends one thing."""
+    """Return an attack: a connection of its own sends one thing."""
 
-    def attack(port: int) -> None:
+    def send(port: int) -> None:
         peer = kind(port)
         try:
             peer.sends(*data)
         finally:
             peer.close()
 
-    return attack
+    return send
 
 
 def instructs(port: int) -> None:
@@ -160,7 +160,7 @@ ATTACKS: Mapping[str, Mapping[str, Callable[[int], None]]] = {
 }
 
 
-def attack(door: str, name: str, port: int, seconds: float) -> None:
+def repeated(door: str, name: str, port: int, seconds: float) -> None:
     once = functools.partial(ATTACKS[door][name], port)
     with suppress(Exception):  # refused, as it should be
         once()  # imports
@@ -213,10 +213,10 @@ def main() -> int:
     options = parser.parse_args()
     if options.attack:
         door, name, port, seconds = options.attack
-        attack(door, name, int(port), float(seconds))
+        repeated(door, name, int(port), float(seconds))
         return 0
     suite = Suite(quick=options.quick)
-    with serving() as doors:
+    with two_doors() as doors:
         for door in [options.only] if options.only else ATTACKS:
             measured(suite, door, doors[door])
     suite.write(options.out)

@@ -84,7 +84,7 @@ class Served:
 
 
 @contextmanager
-def serving() -> Iterator[dict[str, Served]]:
+def two_doors() -> Iterator[dict[str, Served]]:
     """Two sidecars of one policy: `lerobot`, at whose door robots may choose `openpi` too."""
     arbiter = ArbiterProcess(prepared=True).start()
     keys = arbiter.runtime / "keys"
@@ -107,7 +107,7 @@ def serving() -> Iterator[dict[str, Served]]:
 
 @pytest.fixture(scope="session")
 def doors() -> Iterator[dict[str, Served]]:
-    with serving() as served:
+    with two_doors() as served:
         yield served
 
 
