@@ -43,8 +43,9 @@ class ServerConfig(_Section):
     """Name of a service of the user's systemd, else of the machine's. It needs `port`."""
     container: Annotated[str, Field(pattern=CONTAINER_NAME)] | None = None
     """Name of a container of podman or docker, which exists. It needs `port`."""
-    vram: ByteSize
-    """Bytes that it takes at its peak, as `vramctl calibrate` measures them."""
+    vram: ByteSize | None = None
+    """Bytes that it takes at its peak. Null, for a command: those of its entry in
+    `footprints_file`."""
     models: Annotated[tuple[Model, ...], Field(max_length=256)] = ()
     """Names that clients ask for, beside the server's own."""
     on_evict: OnEvict = "stop"
@@ -102,7 +103,7 @@ class ServerConfig(_Section):
         given = (*self.command[1:], *self.env.values())
         if self.port is None and not any("{port}" in one for one in given):
             raise ValueError("expected `port`, or `{port}` in the command: where does it listen?")
-        if not self.vram:
+        if self.vram == 0 or (self.vram is None and not self.command):
             raise ValueError("vram: expected a size above 0, such as 6GiB")
         return self
 
@@ -133,6 +134,8 @@ class GatewayConfig(_Section):
     keys_file: Absolute | None = None
     """YAML file of mode 0600 with the API keys. Null: no keys, which only loopback may do
     without."""
+    footprints_file: Absolute = "/etc/vram-arbiter/footprints.yaml"
+    """YAML file of what `vramctl calibrate --name SERVER` printed, for servers without `vram`."""
     keep_alive_s: Seconds | None = None
     """A request with `stream: true` that waits is answered 200 and gets a comment line
     (server-sent events) this often, so that its client does not time out; a failure is an `error`

@@ -84,8 +84,9 @@ def read_config(path: Path, listen: str | None) -> GatewayConfig:
 def _serve(args: argparse.Namespace) -> int:
     config = read_config(args.config, args.listen)
     need(PROGRAM, "aiohttp", extra="gateway")
-    from vram_arbiter.sidecars.gateway import gateway
+    from vram_arbiter.sidecars.gateway import gateway, program
 
+    config = program.sized(config)
     if args.check:
         gateway.check(config)
         print(f"{len(config.servers)} servers behind {config.listen}")

@@ -45,17 +45,16 @@ LOOK_BYTES: Final = 4096
 SHOWN_AS: Final = {"away": "stopped", "queued": "starting", "leaving": "stopping"}
 """llama-swap's word of a state, where it has another one."""
 
-OPERATIONS: Final[Mapping[str, tuple[str, str]]] = {
-    "/v1/chat/completions": ("chat", "openai"),
-    "/v1/completions": ("text_completion", "openai"),
-    "/v1/responses": ("chat", "openai"),
-    "/v1/embeddings": ("embeddings", "openai"),
-    "/v1/messages": ("chat", "anthropic"),
+OPERATIONS: Final[Mapping[str, tuple[str, str, bool]]] = {
+    "/v1/chat/completions": ("chat", "openai", True),
+    "/v1/completions": ("text_completion", "openai", True),
+    "/v1/responses": ("chat", "openai", False),
+    "/v1/embeddings": ("embeddings", "openai", False),
+    "/v1/messages": ("chat", "anthropic", False),
 }
-"""OpenTelemetry's names of what a path does, and of the API that it is of. Requests of other paths
-are none of `gen_ai`."""
-FIRST_IS_A_TOKEN: Final = frozenset(("/v1/chat/completions", "/v1/completions"))
-"""Streams that begin with a token. Others begin with an event that is sent before there is one."""
+"""OpenTelemetry's names of what a path does, and of the API that it is of; whether its streams
+begin with a token: others begin with an event before one. Requests of other paths are not
+`gen_ai`."""
 
 type Answer = Callable[[web.BaseRequest, Asker], web.StreamResponse]
 
@@ -149,7 +148,8 @@ class Front:
             model, stream = await self._read_model(reply, body, hold)
             server = self._server_of(model, asker)
             reply = reply if stream else Reply(request, None)
-            return await self._pass_on(reply, asker, server, target, bytes(body), model)
+            reply.model = model
+            return await self._pass_on(reply, asker, server, target, bytes(body))
 
     async def _read_model(
         self, reply: Reply, body: bytearray, hold: Callable[[int], None]
@@ -201,16 +201,9 @@ class Front:
             self._held_bytes -= held
 
     async def _pass_on(
-        self,
-        reply: Reply,
-        asker: Asker,
-        server: Server,
-        target: str,
-        begun: bytes = b"",
-        model: str = "",
+        self, reply: Reply, asker: Asker, server: Server, target: str, begun: bytes = b""
     ) -> web.StreamResponse:
-        """Wait for the server, and let it answer. `begun`: what was read of the body; `model`: the
-        one that it names."""
+        """Wait for the server, and let it answer. `begun`: what was read of the body."""
         fields = proxy.upstream_fields(
             reply.request,
             checked=bool(self._keys),
@@ -218,7 +211,7 @@ class Front:
         )
 
         def turn() -> AbstractAsyncContextManager[Turn]:
-            return self._turn(reply, server, asker, target.partition("?")[0], model)
+            return self._turn(reply, server, asker, target.partition("?")[0])
 
         tries = CONNECT_TRIES
         while True:
@@ -246,7 +239,7 @@ class Front:
 
     @asynccontextmanager
     async def _turn(
-        self, reply: Reply, server: Server, asker: Asker, path: str, model: str
+        self, reply: Reply, server: Server, asker: Asker, path: str
     ) -> AsyncIterator[Turn]:
         """Record a turn of the request: span, wait, durations, and that it waits or is in
         flight."""
@@ -270,7 +263,7 @@ class Front:
             finally:
                 meters.shift(phase, -1, labels)
             if path in OPERATIONS:
-                _measure(reply, path, model, granted, labels)
+                _measure(reply, path, granted, labels)
 
     # -- the gateway's own answers
     def _models(self, request: web.BaseRequest, asker: Asker) -> web.Response:
@@ -325,19 +318,17 @@ class Front:
         return self._visible(asker) if model is None else [self._server_of(model, asker)]
 
 
-def _measure(
-    reply: Reply, path: str, model: str, granted: float, labels: Mapping[str, str]
-) -> None:
+def _measure(reply: Reply, path: str, granted: float, labels: Mapping[str, str]) -> None:
     """Measure an answered request of OPERATIONS by OpenTelemetry's names. `granted`: when its
     server could take it (seconds of the loop)."""
-    operation, provider = OPERATIONS[path]
+    operation, provider, begins_with_a_token = OPERATIONS[path]
     labels = {
         **labels,
         telemetry.ATTR_CHAT_OPERATION: operation,
         telemetry.ATTR_PROVIDER: provider,
-        **({telemetry.ATTR_REQUEST_MODEL: model} if model else {}),
+        **({telemetry.ATTR_REQUEST_MODEL: reply.model} if reply.model else {}),
     }
-    if reply.event_at is not None and path in FIRST_IS_A_TOKEN:
+    if reply.event_at is not None and begins_with_a_token:
         meters.measure(telemetry.METRIC_GATEWAY_FIRST_TOKEN, reply.event_at - granted, labels)
     failed = {telemetry.ATTR_ERROR_TYPE: str(reply.status)} if reply.status >= 400 else {}
     took_s = asyncio.get_running_loop().time() - granted

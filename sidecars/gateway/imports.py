@@ -184,16 +184,9 @@ def convert(
     head: dict[str, Any] = {"listen": listen} if listen else {}
     if data.get("sendLoadingState"):
         head["keep_alive_s"] = KEEP_ALIVE_S
-    _check(head, servers, source.name)
     text = yaml.safe_dump(head | {"servers": servers}, sort_keys=False, width=100)
+    load_gateway(text, f"{source.name}, converted")
     return Converted(_HEADER.format(Path(source.name).name) + text, reader.left, reader.noted)
-
-
-def _check(head: JsonMap, servers: JsonMap, name: str) -> None:
-    """Raises ConfigError where the gateway would not read the result, but for missing sizes."""
-    sized = {name: {"vram": "1GiB"} | server for name, server in servers.items()}
-    text = yaml.safe_dump(dict(head) | {"servers": sized}, sort_keys=False)
-    load_gateway(text, f"{name}, converted")
 
 
 # -- values

@@ -7,14 +7,17 @@ and learns from a process with one lease.
 import asyncio
 import json
 import os
+import shlex
 import socket
 import sys
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Final, Self
 
 from vram_arbiter.clients.foreign.control import REST, WANT
 from vram_arbiter.clients.foreign.service import find_container, find_unit
-from vram_arbiter.schemas.config.gateway import ServerConfig
+from vram_arbiter.schemas.config.gateway import GatewayConfig, ServerConfig
+from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.runtime.ports import free_port
 from vram_arbiter.sidecars.gateway.logs import LINE_MAX_BYTES, Log
@@ -151,6 +154,26 @@ def runs_already(config: ServerConfig) -> bool:
     if config.unit is not None:
         return bool(find_unit(config.unit).look()[0])
     return config.container is not None and bool(find_container(config.container, None).look()[0])
+
+
+def sized(config: GatewayConfig) -> GatewayConfig:
+    """Return the configuration with `vram` of all servers, from `footprints_file` where they have
+    none of their own. Raises ConfigError."""
+    unsized = {name: server for name, server in config.servers.items() if server.vram is None}
+    path, entries = Path(config.footprints_file), {}
+    if unsized and path.exists():
+        from vram_arbiter.sidecars.settings import read_footprints
+
+        entries = read_footprints(path)
+    for name, server in unsized.items():
+        if (entry := entries.get(f"local/{name}")) is None:
+            words = shlex.join(place(server.command, server.port or free_port()))
+            raise ConfigError(
+                f"{name} has no `vram`, and {path} no entry local/{name}",
+                hint=f"vramctl calibrate --seconds 60 --name {name} -- {words} >>{path}",
+            )
+        unsized[name] = server.model_copy(update={"vram": entry.load_peak})
+    return config.model_copy(update={"servers": config.servers | unsized})
 
 
 def arguments(name: str, config: ServerConfig, port: int, endpoint: str, control: int) -> list[str]:

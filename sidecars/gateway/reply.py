@@ -69,13 +69,14 @@ class Reply:
 
     `streams`: the head of the event stream is sent. `passes`: the head of the server's answer.
     `lasts`: another request may follow it. `status`: the server's; 0: it has not answered.
-    `event_at`: time of the first event that it streamed (seconds of the loop).
+    `event_at`: time of the first event that it streamed (seconds of the loop). `model`: the one
+    that the body names, where it was looked at.
     """
 
     def __init__(self, request: web.BaseRequest, every_s: float | None) -> None:
         self.request, self._every_s = request, every_s
         self.streams = self.passes = self.lasts = False
-        self.status = 0
+        self.status, self.model = 0, ""
         self.event_at: float | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._asked_for_body = False

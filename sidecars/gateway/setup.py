@@ -324,7 +324,7 @@ def with_kept(found: Found, path: Path) -> Found:
     if not path.exists():
         return found
     before = load_gateway(path.read_text(encoding="utf-8"), str(path))
-    sizes = {one.unit or one.container: one.vram for one in before.servers.values()}
+    sizes = {one.unit or one.container: one.vram or 0 for one in before.servers.values()}
     servers = [
         replace(one, held_bytes=one.held_bytes or sizes.get(one.name, 0)) for one in found.servers
     ]

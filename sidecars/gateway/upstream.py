@@ -169,8 +169,7 @@ class Connection(asyncio.Protocol):
             try:
                 passed = self._body.take(data)
                 sink.write(passed)
-                if self._on_event is not None:
-                    self._look_for_event(passed)
+                self._look_for_event(passed)
             except SidecarUnavailable as error:
                 self.fail(error)
             full = sink.get_write_buffer_size() > HIGH_BYTES

@@ -1,15 +1,19 @@
 """A configuration of llama-swap becomes the gateway's, and what does not is named."""
 
 import argparse
+import re
 from pathlib import Path
 
 import pytest
 
+from vram_arbiter.clients.calibration.entry import entry_of, text_of
+from vram_arbiter.clients.calibration.record import Figures
 from vram_arbiter.schemas.config.gateway import GatewayConfig, load_gateway
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.yamltext import parse_yaml
 from vram_arbiter.sidecars.gateway import imports
 from vram_arbiter.sidecars.gateway.imports import Converted, convert
+from vram_arbiter.sidecars.gateway.program import sized
 
 SIZES = {"": "4GiB"}
 MODELS = """
@@ -143,7 +147,8 @@ def test_mistakes_have_words(text: str, problem: str) -> None:
 def test_a_size_for_one_model_and_none_for_another(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A file without all sizes is written, and does not read: the gateway names what is missing."""
+    """A file without all sizes is written, and the gateway names what is missing, and how to get
+    it."""
     (tmp_path / "swap.yaml").write_text("models: {a: {cmd: 'x ${PORT}'}, b: {cmd: 'y ${PORT}'}}")
     arguments = [str(tmp_path / "swap.yaml"), "--out", str(tmp_path / "out.yaml")]
     parser = argparse.ArgumentParser()
@@ -152,8 +157,15 @@ def test_a_size_for_one_model_and_none_for_another(
     assert imports.run(given) == imports.INCOMPLETE
     assert "not converted: models.b.vram" in capsys.readouterr().err
     text = (tmp_path / "out.yaml").read_text()
-    with pytest.raises(ConfigError, match=r"servers\.b.*vram"):
-        load_gateway(text, "out.yaml")
+    unsized = load_gateway(text + f"footprints_file: {tmp_path}/f.yaml", "out.yaml")
+    with pytest.raises(ConfigError, match="b has no `vram`") as raised:
+        sized(unsized)
+    assert re.fullmatch(
+        rf"vramctl calibrate --seconds 60 --name b -- y \d+ >>{tmp_path}/f.yaml", raised.value.hint
+    )
+    (tmp_path / "f.yaml").write_text(text_of("local/b", entry_of(Figures(3 << 30, 2 << 30), "t")))
+    found = {name: server.vram for name, server in sized(unsized).servers.items()}
+    assert found == {"a": 2 << 30, "b": (3 << 30) + (48 << 20)}, "with the margin of the record"
     with pytest.raises(ConfigError, match="exists"):
         imports.run(given)
     assert (tmp_path / "out.yaml").read_text() == text
