@@ -1,4 +1,4 @@
-"""A program of `prepared` that runs beside its test: what it is told, and what it prints meanwhile."""
+"""A program of `prepared` that runs beside its test: what it is told, and what it prints."""
 
 import contextlib
 import os

@@ -304,7 +304,8 @@ def test_a_model_in_a_sidecar_of_its_own(gpu: Gpu, readings: Path, fake_folder: 
     (fake_folder / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(slow))
     (readings / "rskill.yaml").write_text(MANIFEST)
     sidecar = [
-        sys.executable, f"{ROOT}/tests/sidecars/echo_sidecar.py", str(readings), "--name", "calibrate",
+        sys.executable, f"{ROOT}/tests/sidecars/echo_sidecar.py", str(readings),
+        "--name", "calibrate",
         "--no-arbiter", "--device", gpu.device, "--rskill", str(readings / "rskill.yaml"),
         "--footprint", "1200MiB,1GiB,300MiB",
     ]  # fmt: skip
