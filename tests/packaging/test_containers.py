@@ -24,13 +24,12 @@ import yaml
 
 from tests.packaging.installed import DEPENDENCIES, PYTHON, TREE, install_into
 from tests.packaging.machine import TOOLS, obstacle
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 from vram_arbiter.clients.cli.doctor.health import UNIT_SCORE
 from vram_arbiter.schemas.runtime.trust import SERVICE_USERS
 
 FOLDER = TREE / "configs" / "containers"
 IMAGES = {"arbiter": "Containerfile", "reward": "Containerfile.sidecar"}
-PATIENCE_S = 60.0
 OBSTACLE = obstacle()
 
 

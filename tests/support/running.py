@@ -8,8 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import IO
 
 from tests.support.prepared import Forked, start
-
-PATIENCE_S = 60.0
+from tests.support.waiting import PATIENCE_S
 
 
 class Running:

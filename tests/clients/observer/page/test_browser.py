@@ -12,6 +12,7 @@ from tests.support.process import ArbiterProcess
 from tests.support.status_page import get, port_of
 from tests.support.waiting import until
 from tests.support.wire import WireClient
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.runtime.ports import free_port
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ pytestmark = [
         reason="needs Debian's chromium and chromium-driver (.ci/setup full installs them as root)",
     ),
 ]
-GIB = 1 << 30
 SHOWN_S = 60.0
 NAME = "<script>window.harm=1</script>"
 FLAGS = (
