@@ -40,7 +40,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 LONGEST = (
     "tests/e2e/test_demo.py",
-    "tests/packaging/test_readme.py",
     "tests/runner/recording/",
     "tests/e2e/",
     "tests/sidecars/",
@@ -51,6 +50,7 @@ LONGEST = (
     "tests/runner/cli/",
     "tests/runner/sim/test_benchmark.py",
     "tests/bench/",
+    "tests/clients/observer/",
     "tests/arbiter/core/test_machine.py",
     "tests/arbiter/test_",
 )

@@ -13,15 +13,12 @@ from pathlib import Path
 import pytest
 
 from tests.support.prepared import run
-from tests.support.process import ArbiterProcess
-from tests.support.waiting import until
+from tests.support.process import ArbiterProcess, Make
+from tests.support.waiting import PATIENCE_S, until
 from tests.support.wire import WireClient
+from vram_arbiter.schemas.defaults import GIB
 
 pytestmark = pytest.mark.e2e
-PATIENCE_S = 60
-GIB = 1 << 30
-
-Make = Callable[..., ArbiterProcess]
 
 
 def run_daemon(

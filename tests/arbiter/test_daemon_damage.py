@@ -16,13 +16,13 @@ import pytest
 
 from tests.support.process import ArbiterProcess
 from tests.support.running import Running, running
+from tests.support.waiting import PATIENCE_S
 from tests.support.wire import WireClient
+from vram_arbiter.schemas.defaults import GIB
 
 pytestmark = pytest.mark.e2e
-GIB = 1 << 30
 PAGE = 4096
 FRAME = 24 + PAGE
-PATIENCE_S = 60.0
 
 HOLDER = """
 import asyncio, sys

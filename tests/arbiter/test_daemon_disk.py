@@ -16,11 +16,11 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from tests.support.process import ArbiterProcess, vramctl
+from tests.support.waiting import PATIENCE_S
 from tests.support.wire import WireClient
+from vram_arbiter.schemas.defaults import GIB
 
 pytestmark = pytest.mark.e2e
-PATIENCE_S = 60
-GIB = 1 << 30
 BEAT = {"WATCHDOG_USEC": "600000"}
 """The daemon looks after its files at every beat, which this makes 0.2 s."""
 

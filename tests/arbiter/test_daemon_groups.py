@@ -7,16 +7,14 @@ Real daemon, real users.
 import grp
 import json
 import os
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from tests.support.prepared import run
-from tests.support.process import ArbiterProcess
+from tests.support.process import ArbiterProcess, Make
 
 pytestmark = pytest.mark.e2e
-Make = Callable[..., ArbiterProcess]
 NOBODY = 65534
 CLIENT = """
 import json, os, sys

@@ -12,9 +12,9 @@ import zmq
 
 from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
+from vram_arbiter.schemas.defaults import GIB
 
 pytestmark = pytest.mark.e2e
-GIB = 1 << 30
 
 
 def still_held(holder: WireClient) -> bool:

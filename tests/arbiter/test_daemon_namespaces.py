@@ -5,18 +5,16 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.support.process import ArbiterProcess
+from tests.support.process import Make
 from tests.support.processes import children
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
-PATIENCE_S = 60
 UNSHARE = ["unshare", "--pid", "--fork", "--kill-child", "--mount-proc"]
 INSIDE = """
 import os, sys
@@ -26,8 +24,6 @@ with WireClient(sys.argv[1]) as client:
     print(os.getpid(), flush=True)
     sys.stdin.read()
 """
-
-Make = Callable[..., ArbiterProcess]
 
 
 def can_unshare() -> bool:

@@ -2,18 +2,15 @@
 
 import json
 import sys
-from collections.abc import Callable
 
 import pytest
 
-from tests.support.process import ArbiterProcess, vramctl
+from tests.support.process import ArbiterProcess, Make, vramctl
 from tests.support.waiting import until
 from vram_arbiter.arbiter.eventlog import replay as runner
 from vram_arbiter.arbiter.eventlog.logfile import FOLDER
 
 pytestmark = pytest.mark.e2e
-
-Make = Callable[..., ArbiterProcess]
 
 
 def lease_something(arbiter: ArbiterProcess) -> None:

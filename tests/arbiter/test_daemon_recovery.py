@@ -5,25 +5,22 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from tests.support.process import ArbiterProcess
+from tests.support.process import ArbiterProcess, Make
 from tests.support.running import Running, running
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 from tests.support.wire import TTL_S, WireClient
 from vram_arbiter.arbiter.host.journal import Journal
 from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime.procfs import boot_id, start_ticks
 
 pytestmark = pytest.mark.e2e
-GIB = 1 << 30
-PATIENCE_S = 60.0
-
-Make = Callable[..., ArbiterProcess]
 
 
 def occupy(arbiter: ArbiterProcess, size: int) -> None:

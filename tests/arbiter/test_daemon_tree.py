@@ -16,12 +16,12 @@ import pytest
 from tests.support.prepared import Forked
 from tests.support.process import ArbiterProcess
 from tests.support.running import running
+from tests.support.waiting import PATIENCE_S
 from tests.support.wire import WireClient
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.runtime import procfs
 
 pytestmark = pytest.mark.e2e
-GIB = 1 << 30
-PATIENCE_S = 60.0
 
 CHILD = """
 import os, sys

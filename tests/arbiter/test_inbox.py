@@ -9,14 +9,13 @@ from functools import partial
 from typing import Any
 
 from tests.support.messages import IDLE_STATUS, no_reason
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.arbiter.core.effects import Effect, Note
 from vram_arbiter.arbiter.core.events import ClientLeft, Event, Resumed, Tick
 from vram_arbiter.arbiter.inbox import ANSWERS_AT_ONCE, QUESTIONS_MAX, Inbox
 from vram_arbiter.schemas.ids import ClientId, GpuId
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import StatusReply
-
-PATIENCE_S = 60.0
 
 
 def left(name: str) -> ClientLeft:

@@ -9,23 +9,21 @@ import os
 import signal
 import sys
 import textwrap
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.support.process import ArbiterProcess
+from tests.support.process import ArbiterProcess, Make
+from tests.support.waiting import PATIENCE_S
 from tests.support.wire import WireClient
+from vram_arbiter.schemas.defaults import GIB
 
 pytestmark = pytest.mark.e2e
-PATIENCE_S = 60
 WATCHDOG_S = 0.6
-GIB = 1 << 30
 SMALL = 200 << 20
 """No bytes are on the GPU here: a larger lease would be void at the restart, because the GPU is
 read as empty."""
 
-Make = Callable[..., ArbiterProcess]
 
 CORE = """
     class Stuck(daemon.Arbiter):

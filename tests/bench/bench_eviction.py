@@ -11,9 +11,10 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
-from tests.bench.harness import GIB, WIDE, Peer, Suite, arbiter
+from tests.bench.harness import WIDE, Peer, Suite, arbiter
 from tests.support.process import ArbiterProcess
 from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.runtime.fakegpu_folder import locked

@@ -19,6 +19,7 @@ from urllib.request import urlopen
 import yaml
 
 from tests.support.waiting import until
+from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.runtime import fakegpu_folder
 from vram_arbiter.schemas.runtime.ports import free_port
 
@@ -31,7 +32,6 @@ asked.connect({path!r})
 asked.sendall((" ".join(sys.argv[1:]) + "\\n").encode())
 print(asked.makefile().read(), end="")
 """
-MIB = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)

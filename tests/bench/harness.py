@@ -26,12 +26,10 @@ import msgpack
 import zmq
 
 from tests.support.process import ArbiterProcess
-from vram_arbiter.schemas.defaults import WIRE_VERSION
+from vram_arbiter.schemas.defaults import KIB, WIRE_VERSION
 
 HERE = Path(__file__).parent
 ANSWER_TIMEOUT_S = 30.0
-KIB = 1 << 10
-GIB = 1 << 30
 SLIVER = 4 * KIB
 """The footprint of a lease where bytes are not the subject: many fit, none has to be measured gone
 before the next."""

@@ -13,7 +13,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
-PATIENCE_S = 60.0
+from tests.support.waiting import PATIENCE_S
+
 LAST = b"0\r\n\r\n"
 """No event ends so."""
 

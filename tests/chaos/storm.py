@@ -36,6 +36,7 @@ from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.codec import to_map
+from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.fakegpu_folder import locked
@@ -60,7 +61,6 @@ STEP_WAIT_S = 3.0
 LAG_S = 0.1
 CALM_S = 45.0
 STATE_BYTES = 64 << 20
-MIB = 1 << 20
 CONFIG = """
 verify: {timeout_s: 1.0}
 revoke: {remind_s: 0.5, deadline_s: 4.0}

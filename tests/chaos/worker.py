@@ -22,6 +22,7 @@ from typing import Any
 from tests.support.attacks import ATTACKS
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
+from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.fakegpu import SimulatedOutOfMemory
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
@@ -29,7 +30,6 @@ from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 from vram_arbiter.sidecars.device.memory import Block
 
-MIB = 1 << 20
 CHUNKS = 3
 LOAD_S, UNLOAD_S, USE_S, IDLE_S = 0.05, 0.03, 0.12, 0.1
 """Longest pauses. A step has to last long enough for a fault to meet it."""

@@ -10,11 +10,11 @@ import pytest
 from tests.support.beside import Beside, Start
 from tests.support.process import ArbiterProcess
 from tests.support.protocol_wire import Wire
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
-DEADLINE_S = 60.0
 TTL_S = 120.0
 """A daemon that is started again on a busy machine is away for seconds: nobody is to fence himself
 meanwhile."""
@@ -54,7 +54,7 @@ def until() -> Callable[..., object]:
     """`await until(lambda: …)`: poll on the loop until it is true; fails after a minute."""
 
     async def wait(condition: Callable[[], bool]) -> None:
-        with anyio.fail_after(DEADLINE_S):
+        with anyio.fail_after(PATIENCE_S):
             while not condition():
                 await anyio.sleep(0.01)
 

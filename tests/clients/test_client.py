@@ -3,7 +3,7 @@
 import contextlib
 import json
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,9 @@ import anyio.to_thread
 import pytest
 
 from tests.support.beside import Canceled, Start, within
-from tests.support.leases import states
+from tests.support.leases import Spec, Until, states
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients._protocol.connection import REQUEST_TIMEOUT_S
 from vram_arbiter.clients._protocol.records import Eviction
 from vram_arbiter.clients.client import AsyncClient
@@ -31,7 +32,6 @@ from vram_arbiter.schemas.errors import (
 )
 from vram_arbiter.schemas.wire.replies import AnyReply
 from vram_arbiter.schemas.wire.requests import Acquire, Evict, Status, Unloading
-from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import Totals
 
 pytestmark = [
@@ -39,10 +39,6 @@ pytestmark = [
     pytest.mark.parametrize("anyio_backend", ["asyncio", "trio"]),
     pytest.mark.e2e,
 ]
-
-Spec = Callable[..., LeaseSpec]
-Until = Callable[[Callable[[], bool]], Awaitable[None]]
-WAIT_S = 60.0
 
 
 async def test_acquire_ready_use_release(arbiter_daemon: ArbiterProcess, spec: Spec) -> None:
@@ -73,7 +69,7 @@ async def test_an_evicted_holder_hears_by_whom_and_why(
         first = await client.acquire(spec("a", 5))
         await first.ready()
         assert first.evicted is None
-        second = await ops.acquire(spec("b", 5), WAIT_S)
+        second = await ops.acquire(spec("b", 5), PATIENCE_S)
         assert first.evicted == Eviction("waiter", "b", "b needs the room", 50)
         with pytest.raises(LeaseLost, match="was evicted: b needs the room"):
             await first.ready()
@@ -157,7 +153,7 @@ async def test_closing_the_client_gives_up_its_leases(
             lease = await client.acquire(spec("a", 5), unload=unload)
             await lease.ready()
         assert unloaded.is_set()
-        await (await other.acquire(spec("b", 7), WAIT_S)).release()
+        await (await other.acquire(spec("b", 7), PATIENCE_S)).release()
 
 
 async def test_leaving_does_not_wait_for_an_arbiter_that_is_away(
@@ -169,7 +165,7 @@ async def test_leaving_does_not_wait_for_an_arbiter_that_is_away(
         unloaded.set()
 
     arbiter = make_arbiter().start()
-    async with within(WAIT_S), AsyncClient("t", endpoint=arbiter.endpoint) as client:
+    async with within(PATIENCE_S), AsyncClient("t", endpoint=arbiter.endpoint) as client:
         lease = await client.acquire(spec("a", 5, ttl_s=3600), unload=unload)
         await lease.ready()
         process = arbiter.process
@@ -233,7 +229,7 @@ async def test_a_holder_stays_when_nothing_wants_its_room_any_more(
             async with lease.use(name):
                 with pytest.raises(WaitTimeout):
                     await waiter.acquire(spec("b", 5), wait_timeout_s=0.5)
-                with anyio.fail_after(WAIT_S):
+                with anyio.fail_after(PATIENCE_S):
                     while (state := lease.state) != "held":
                         await lease.wait_change(state)
                 assert lease.evicted is None
@@ -242,7 +238,7 @@ async def test_a_holder_stays_when_nothing_wants_its_room_any_more(
         assert story == []
         kinds = [event["kind"] for event in (await waiter.history(0, 500)).events]
         assert kinds.count("revoke_withdrawn") == 2
-        other = await waiter.acquire(spec("b", 5), WAIT_S)
+        other = await waiter.acquire(spec("b", 5), PATIENCE_S)
         assert (story, lease.state, other.state) == (["unload"], "gone", "loading")
 
 
@@ -334,10 +330,10 @@ async def test_an_acquire_cancelled_at_any_moment_leaks_nothing(
                 await (await waiting).release()  # it was faster
             except Canceled:
                 pass
-        async with within(WAIT_S):
+        async with within(PATIENCE_S):
             while await states(client):
                 await anyio.sleep(0.01)
-        whole = await client.acquire(spec("whole", 5), WAIT_S)
+        whole = await client.acquire(spec("whole", 5), PATIENCE_S)
         assert (whole.state, await states(client)) == ("loading", {"whole": "loading"})
 
 
@@ -353,7 +349,7 @@ async def test_callbacks_that_raise_do_not_keep_the_lease(
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         lease = await client.acquire(spec("a", 5), unload=unload, on_revoke=revoked)
         await lease.ready()
-        second = await client.acquire(spec("b", 5), WAIT_S)
+        second = await client.acquire(spec("b", 5), PATIENCE_S)
         await lease.wait_gone()
         assert second.state == "loading"
 
@@ -382,7 +378,10 @@ async def test_a_word_that_the_arbiter_refuses_is_said_again(
 
         monkeypatch.setattr(client._session.protocol.holdings, "ask", counted)
         monkeypatch.setattr(client._session, "reply", refused_once)
-        async with AsyncClient("other", endpoint=arbiter_daemon.endpoint) as other, within(WAIT_S):
+        async with (
+            AsyncClient("other", endpoint=arbiter_daemon.endpoint) as other,
+            within(PATIENCE_S),
+        ):
             await (await other.acquire(spec("b", 5))).release()
             await lease.wait_gone()
         assert len(said) == 2
@@ -406,7 +405,7 @@ async def test_a_release_that_is_refused_ends_the_lease_all_the_same(
             await lease.release()
         monkeypatch.undo()
         assert lease.state == "gone"
-        async with within(WAIT_S):
+        async with within(PATIENCE_S):
             await lease.wait_gone()
 
 
@@ -440,7 +439,7 @@ async def test_subscribers_see_events_in_order(
     async def follow(client: AsyncClient, started: anyio.Event) -> None:
         events = client.subscribe()
         first = beside(one(events))
-        await client.ping(timeout_s=WAIT_S)
+        await client.ping(timeout_s=PATIENCE_S)
         started.set()
         kinds.append((await first)["kind"])
         async for event in events:
@@ -455,7 +454,7 @@ async def test_subscribers_see_events_in_order(
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
         await lease.release()
-        async with within(WAIT_S):
+        async with within(PATIENCE_S):
             await following
         kinds = [
             kind for kind in kinds if kind != "queued"

@@ -2,7 +2,7 @@
 
 import signal
 import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 
 import anyio
 import anyio.to_thread
@@ -10,11 +10,11 @@ import pytest
 from anyio.streams.buffered import BufferedByteReceiveStream
 
 from tests.support.beside import Start, within
-from tests.support.leases import states
+from tests.support.leases import Spec, Until, states
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.errors import LeaseLost, VramError
-from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
 
 pytestmark = [
@@ -23,10 +23,6 @@ pytestmark = [
     pytest.mark.e2e,
 ]
 
-Spec = Callable[..., LeaseSpec]
-Until = Callable[[Callable[[], bool]], Awaitable[None]]
-WAIT_S = 60.0
-
 
 async def test_a_restart_of_the_daemon_is_ridden_out(
     make_arbiter: Callable[..., ArbiterProcess], spec: Spec, until: Until, beside: Start
@@ -34,7 +30,7 @@ async def test_a_restart_of_the_daemon_is_ridden_out(
     arbiter = make_arbiter().start()
     async with AsyncClient("t", endpoint=arbiter.endpoint) as client:
         pinned = await client.acquire(spec("a", 5))
-        waiting = beside(client.acquire(spec("b", 2), WAIT_S))
+        waiting = beside(client.acquire(spec("b", 2), PATIENCE_S))
         while "b" not in await states(client):
             await anyio.sleep(0.01)
         process = arbiter.process
@@ -78,7 +74,7 @@ async def test_self_fencing(
         process.wait()
         # without an arbiter only: a busy machine may take longer over a short ttl than it lasts
         client._session.protocol.connection.grace_s = -lease.spec.ttl_s
-        async with within(WAIT_S):
+        async with within(PATIENCE_S):
             await lease.wait_gone()
         assert unloaded.is_set()
         assert [type(error) for error in lost] == [LeaseLost]
@@ -121,7 +117,7 @@ async def test_a_use_begins_without_the_daemon_and_is_told_when_it_is_back(
     """Regression: a use that began before the client noticed the daemon's death waited until the
     lease was fenced, and a robot's goal with it."""
     arbiter = make_arbiter().start()
-    async with AsyncClient("sidecar", endpoint=arbiter.endpoint) as client, within(WAIT_S):
+    async with AsyncClient("sidecar", endpoint=arbiter.endpoint) as client, within(PATIENCE_S):
         lease = await client.acquire(spec("a", 5))
         await lease.ready()
         arbiter.kill()
@@ -169,12 +165,12 @@ async def test_leases_and_uses_survive_a_kill_of_the_daemon(
                 await until(lambda: not client.connected)
                 await anyio.to_thread.run_sync(arbiter.start)
                 await until(lambda: client.connected)
-                async with within(WAIT_S):
+                async with within(PATIENCE_S):
                     while (shown := (await client.status()).leases[0]).uses != 2:
                         await anyio.sleep(0.01)
             assert (shown.lease_id, shown.state) == (lease.lease_id, "held")
             assert client.epoch > lease.token[0]
-            wanted = beside(client.acquire(spec("b", 5), WAIT_S))
+            wanted = beside(client.acquire(spec("b", 5), PATIENCE_S))
             await until(lambda: lease.revoking)
             assert not unloaded.is_set()  # the runner's goal goes on
             await runner.stdin.send(b"end\n")

@@ -2,17 +2,19 @@
 asyncio and on trio.
 """
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 
 import anyio
 import pytest
 
 from tests.support.beside import Start, within
-from tests.support.leases import states
+from tests.support.leases import Spec, Until, states
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients import use_context
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease, LeaseState
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.errors import BadState, LeaseRevoking, WaitTimeout, WouldDeadlock
 from vram_arbiter.schemas.ids import Token
 from vram_arbiter.schemas.wire.pushes import RevokePush
@@ -24,11 +26,6 @@ pytestmark = [
     pytest.mark.parametrize("anyio_backend", ["asyncio", "trio"]),
     pytest.mark.e2e,
 ]
-
-GIB = 1 << 30
-WAIT_S = 60.0
-Spec = Callable[..., LeaseSpec]
-Until = Callable[[Callable[[], bool]], Awaitable[None]]
 
 
 class Model:
@@ -76,7 +73,7 @@ async def test_a_standby_lease_returns_by_itself_when_there_is_room(
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         detector = await on_standby(client, spec, model)
         first = detector.token
-        policy = await client.acquire(spec("policy", 4), WAIT_S)
+        policy = await client.acquire(spec("policy", 4), PATIENCE_S)
         await policy.ready()
         assert detector.state == "standby"
         with pytest.raises(LeaseRevoking):
@@ -104,10 +101,10 @@ async def test_a_task_that_follows_a_lease_sees_where_it_goes(
     arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
 ) -> None:
     model = Model()
-    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client, within(WAIT_S):
+    async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client, within(PATIENCE_S):
         detector = await on_standby(client, spec, model)
         assert (detector.state, detector.given_up) == ("held", False)
-        policy = await client.acquire(spec("policy", 4), WAIT_S)
+        policy = await client.acquire(spec("policy", 4), PATIENCE_S)
         await policy.ready()
         returning = beside(followed(detector, "held"))
         await anyio.wait_all_tasks_blocked()  # it follows
@@ -132,7 +129,7 @@ async def test_a_standby_lease_survives_the_daemon(
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         detector = await on_standby(client, spec, model)
         memory = FakeMemory(arbiter_daemon.gpu_folder, "t", 0)
-        policy = await client.acquire(spec("policy", 4), WAIT_S)
+        policy = await client.acquire(spec("policy", 4), PATIENCE_S)
         block = memory.allocate("policy", 4 * GIB)
         await policy.ready()
         arbiter_daemon.kill()
@@ -152,13 +149,13 @@ async def test_a_standby_lease_can_ask_to_come_back_or_be_given_up(
     async with AsyncClient("t", endpoint=arbiter_daemon.endpoint) as client:
         detector = await on_standby(client, spec, model)
         other = Model()
-        policy = await client.acquire(spec("policy", 4), WAIT_S, unload=other.unload)
+        policy = await client.acquire(spec("policy", 4), PATIENCE_S, unload=other.unload)
         await policy.ready()
-        await detector.reacquire(WAIT_S)
+        await detector.reacquire(PATIENCE_S)
         await until(lambda: detector.state == "held")
         await policy.wait_gone()
         assert other.did == ["unload"]
-        policy = await client.acquire(spec("policy", 4), WAIT_S)
+        policy = await client.acquire(spec("policy", 4), PATIENCE_S)
         assert detector.state == "standby"
         await detector.give_up()
         assert detector.state == "gone"
@@ -173,11 +170,11 @@ async def test_weights_are_parked_where_the_budget_has_room(
     async with AsyncClient("t", endpoint=arbiter.endpoint) as client:
         detector = await parkable(client, spec, model)
         policy = await client.acquire(
-            spec("policy", 4, park_bytes=5 * GIB), WAIT_S, unload=model.unload
+            spec("policy", 4, park_bytes=5 * GIB), PATIENCE_S, unload=model.unload
         )
         await policy.ready()
         assert (detector.state, model.did) == ("parked", ["park"])
-        await detector.reacquire(WAIT_S)
+        await detector.reacquire(PATIENCE_S)
         await until(lambda: detector.state == "held")
         assert model.did == ["park", "unload", "load"]
         await detector.park()
@@ -198,7 +195,7 @@ async def test_who_parks_hears_how_it_ended_not_how_it_was_meant(
     was `parked`, and gone a moment later."""
     arbiter = make_arbiter(config="host:\n  park_budget_bytes: 0\n").start()
     model = Model()
-    async with AsyncClient("t", endpoint=arbiter.endpoint) as client, within(WAIT_S):
+    async with AsyncClient("t", endpoint=arbiter.endpoint) as client, within(PATIENCE_S):
         detector = await parkable(client, spec, model)
         parking = beside(detector.park())
         while not parking.done:
@@ -227,7 +224,7 @@ async def test_a_job_that_waits_for_its_own_room_is_told(
             assert told.value.details["waited"]["why"]["consumer"] == "llm"
             with pytest.raises(WaitTimeout):
                 await client.acquire(spec("llm", 5), 0.1)
-            prefetch = beside(client.acquire(spec("next", 5), WAIT_S))
+            prefetch = beside(client.acquire(spec("next", 5), PATIENCE_S))
         await job.give_up()
         assert (await another).state == "loading"
         await (await another).give_up()
@@ -236,4 +233,4 @@ async def test_a_job_that_waits_for_its_own_room_is_told(
 
 async def asked_when(happens: anyio.Event, client: AsyncClient, spec: LeaseSpec) -> AsyncLease:
     await happens.wait()
-    return await client.acquire(spec, WAIT_S)
+    return await client.acquire(spec, PATIENCE_S)

@@ -8,6 +8,7 @@ import anyio
 import pytest
 from anyio.abc import TaskGroup
 
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients._protocol.records import LeaseRecord
 from vram_arbiter.clients.eviction import Departure
 from vram_arbiter.schemas.errors import BadState
@@ -16,7 +17,6 @@ from vram_arbiter.schemas.wire.replies import AnyReply
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 pytestmark = pytest.mark.anyio
-WAIT_S = 60.0
 
 
 class WithdrawingDriver:
@@ -51,7 +51,7 @@ async def test_who_waits_for_a_change_hears_of_a_late_withdrawal() -> None:
         driver = cast(Any, WithdrawingDriver(group, record))
         departure = Departure(driver, record, spec, None, None)
         departure.start()
-        with anyio.fail_after(WAIT_S):
+        with anyio.fail_after(PATIENCE_S):
             while departure.asked:
                 await departure.progress.wait()
     assert not departure.gone

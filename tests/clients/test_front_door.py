@@ -14,6 +14,7 @@ import pytest
 
 import vram_arbiter
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter import (
     AsyncClient,
     AsyncForeignUse,
@@ -30,7 +31,6 @@ from vram_arbiter import (
 )
 from vram_arbiter.schemas.defaults import GIB, RESIDUE_BYTES
 
-DEADLINE_S = 60.0
 TWINS = [(Client, AsyncClient), (Lease, AsyncLease), (Use, AsyncUse), (ForeignUse, AsyncForeignUse)]
 
 
@@ -173,13 +173,13 @@ class TestThreads:
 
         def restore(_: Lease) -> None:
             began.set()
-            assert loaded.wait(DEADLINE_S)
+            assert loaded.wait(PATIENCE_S)
 
         with Client("t", endpoint=arbiter_daemon.endpoint) as arbiter:
             first = arbiter.acquire(vram="5GiB", standby=True, restore=restore, min_residency_s=0.0)
             first.ready()
             arbiter.acquire(vram="5GiB", consumer="other").release()
-            assert began.wait(DEADLINE_S)
+            assert began.wait(PATIENCE_S)
             assert first.state == "loading"
             threading.Timer(0.05, loaded.set).start()
             with first.use():  # waits until it is loaded
@@ -203,7 +203,7 @@ class TestThreads:
             thread.start()
             while not following.wait(0.05):
                 arbiter.acquire(vram="1GiB").release()
-        thread.join(DEADLINE_S)
+        thread.join(PATIENCE_S)
         assert ended
 
     @pytest.mark.parametrize(

@@ -4,20 +4,17 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tests.support.leases import Spec
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.errors import ArbiterUnreachable, BadState, LeaseLost, LeaseRevoking
-from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 pytestmark = pytest.mark.e2e
-
-Spec = Callable[..., LeaseSpec]
-PATIENCE_S = 60.0
 
 
 def test_lease_use_release(client: Client, spec: Spec) -> None:

@@ -24,13 +24,12 @@ import yaml
 
 from tests.packaging.installed import DEPENDENCIES, PYTHON, TREE, install_into
 from tests.packaging.machine import TOOLS, obstacle
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 from vram_arbiter.clients.cli.doctor.health import UNIT_SCORE
 from vram_arbiter.schemas.runtime.trust import SERVICE_USERS
 
 FOLDER = TREE / "configs" / "containers"
 IMAGES = {"arbiter": "Containerfile", "reward": "Containerfile.sidecar"}
-PATIENCE_S = 60.0
 OBSTACLE = obstacle()
 
 
@@ -203,8 +202,9 @@ def test_the_arbiter_is_pid_1_of_a_read_only_container(tmp_path: Path) -> None:
     holder's end, and ends by SIGTERM, which the kernel withholds from a PID 1 without a handler."""
     os.chmod(tmp_path, 0o755)
     with container(tmp_path) as made:
+        until(Path(f"/proc/{made.pid}/root/run/vram-arbiter/arbiter.sock").exists)
         health = compose()["services"]["arbiter"]["healthcheck"]["test"][1:]
-        until(lambda: made.run(*health).returncode == 0 or None)
+        assert made.run(*health).returncode == 0
         assert "Read-only file system" in made.run("touch", "/var/lib/a", "/tmp/a").stderr
         status = Path(f"/proc/{made.pid}/status").read_text()
         assert re.search(r"^NSpid:.*\t1$", status, re.MULTILINE)

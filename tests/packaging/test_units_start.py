@@ -123,7 +123,7 @@ def answer_of[T](found: Callable[[], T | None], what: Callable[[], str]) -> T:
     deadline = time.monotonic() + PATIENCE_S
     while (answer := found()) is None:
         assert time.monotonic() < deadline, f"not in time:\n{what()}"
-        time.sleep(0.05)
+        time.sleep(0.2)  # each look starts programs inside
     return answer
 
 

@@ -1,5 +1,6 @@
-"""The whole arbiter under faults: two seeds in every run of the tests, a few more at night; `make
-sim SEEDS=1000` runs many, `make sim SEED=n` one again."""
+"""The whole arbiter under faults: three seeds in every run of the tests, with every kind of fault,
+note and verdict of six; a few more at night. `make sim SEEDS=1000` runs many, `make sim SEED=n` one
+again."""
 
 import asyncio
 import contextlib
@@ -29,7 +30,7 @@ A, B, GPU = ProcessKey(1, 1), ProcessKey(2, 2), GpuId("GPU-0")
 
 
 @pytest.mark.parametrize(
-    "seed", [0, 2, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 3, 4, 5))]
+    "seed", [0, 2, 3, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 4, 5))]
 )
 def test_nothing_that_must_hold_breaks_under_faults(seed: int) -> None:
     report = first_report(seed)

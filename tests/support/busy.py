@@ -4,10 +4,8 @@ replays."""
 from random import Random
 
 from tests.support.core_driver import Consumer, CoreDriver
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import LeaseId
-
-GIB, MIB = d.GIB, d.MIB
 
 PROBE_FAILURE = "the driver hangs"
 """What a failed reading of the driver reports."""

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.support.prepared import Forked, start
+from tests.support.waiting import PATIENCE_S
 
-PATIENCE_S = 60.0
 _READ_MAX = 65_536
 
 

@@ -9,7 +9,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
 from typing import Any, Self
 
-WAIT_S = 60.0
+from tests.support.waiting import PATIENCE_S
+
 EXPORTERS_MAX = 128
 """Connections that the kernel takes while nobody here has the time to."""
 
@@ -112,9 +113,9 @@ class _Server(ThreadingHTTPServer):
                 return before is not None and not before & self._open
 
             with self._changed:
-                settled = self._changed.wait_for(read, WAIT_S)
+                settled = self._changed.wait_for(read, PATIENCE_S)
                 del self._markers[name]
-        assert settled, f"the collector has not read in {WAIT_S} s what it was sent"
+        assert settled, f"the collector has not read in {PATIENCE_S} s what it was sent"
 
 
 class Collector:
@@ -155,7 +156,7 @@ class Collector:
         A machine too busy to listen is no collector that is away."""
         return {
             "OTEL_EXPORTER_OTLP_ENDPOINT": self.endpoint,
-            "OTEL_EXPORTER_OTLP_TIMEOUT": str(WAIT_S),
+            "OTEL_EXPORTER_OTLP_TIMEOUT": str(PATIENCE_S),
             "OTEL_BSP_SCHEDULE_DELAY": str(schedule_ms),
             "OTEL_METRIC_EXPORT_INTERVAL": "200",
         }
@@ -199,7 +200,7 @@ class Collector:
         with self._came:
             return list(self._lines)
 
-    def wait(self, condition: Callable[[], bool], what: str, timeout_s: float = WAIT_S) -> None:
+    def wait(self, condition: Callable[[], bool], what: str, timeout_s: float = PATIENCE_S) -> None:
         """Until `condition()` holds, looked at whenever something came. Raises AssertionError with
         what was waited for and what came."""
         self._waiting.now = True

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from tests.support.wire import WireClient
+from vram_arbiter.schemas.defaults import GIB
 
-GIB = 1 << 30
-WAIT_S = 60.0
 MEMORY_SLACK_KIB = 64 * 1024
 DESCRIPTOR_SLACK = 8
 
@@ -53,7 +53,7 @@ class Honest:
         leaves is closed, a little later."""
         with WireClient(self.arbiter.endpoint) as late:  # accepted behind every earlier connection
             assert late.hello("late", role="observer").ask("bye")["ok"]
-        deadline = time.monotonic() + WAIT_S
+        deadline = time.monotonic() + PATIENCE_S
         while trace := self._trace_of_others():
             assert time.monotonic() < deadline, trace
             self.client.receive(0.05)

@@ -1,8 +1,15 @@
 """Leases as a client of the daemon sees them."""
 
+from collections.abc import Awaitable, Callable
+
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.sync import Client
+from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import LeaseView
+
+Spec = Callable[..., LeaseSpec]
+Until = Callable[[Callable[[], bool]], Awaitable[None]]
+"""Fixtures `spec` and `until` of tests/clients/conftest.py."""
 
 
 def view_of(client: Client, consumer: str) -> LeaseView:

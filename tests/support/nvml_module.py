@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 from typing import Any
 
-GIB = 2**30
+from vram_arbiter.schemas.defaults import GIB
 
 
 class NVMLError(Exception):

@@ -5,7 +5,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-GIB, MIB = 2**30, 2**20
+from vram_arbiter.schemas.defaults import GIB, MIB
 
 
 @dataclass

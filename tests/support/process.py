@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -200,6 +200,8 @@ class ArbiterProcess:
 
 
 type Finished = subprocess.CompletedProcess[str]
+Make = Callable[..., ArbiterProcess]
+"""Fixture `make_arbiter`."""
 
 
 def vramctl(

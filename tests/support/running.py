@@ -1,4 +1,4 @@
-"""A program of `prepared` that runs beside its test: what it is told, and what it prints meanwhile."""
+"""A program of `prepared` that runs beside its test: what it is told, and what it prints."""
 
 import contextlib
 import os
@@ -8,8 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import IO
 
 from tests.support.prepared import Forked, start
-
-PATIENCE_S = 60.0
+from tests.support.waiting import PATIENCE_S
 
 
 class Running:

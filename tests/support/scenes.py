@@ -4,10 +4,8 @@ sent away, a tree of leases."""
 from typing import Any, Literal
 
 from tests.support.core_driver import Consumer, CoreDriver
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import LeaseId
-
-GIB = d.GIB
 
 
 def held(

@@ -6,13 +6,13 @@ from typing import Any
 from tests.support.children import Child, spawn
 from tests.support.fakegpu_check import check_log
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from tests.support.wire import WireClient
 from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.defaults import GIB
 
-GIB = 1 << 30
 CAPACITY = 8 * GIB
 LAG_S = 0.15
-PATIENCE_S = 60.0
 
 
 class Stage:

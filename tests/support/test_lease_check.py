@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from tests.support.lease_check import NOISE_BYTES, Hindrance, Story, check_leases
+from vram_arbiter.schemas.defaults import GIB
 
-GIB = 1 << 30
 A, B, IDLE, STRANGER = 11, 12, 13, 99
 FOREVER = float("inf")
 

@@ -112,8 +112,8 @@ class WireClient:
             "residue_bytes": spec.pop("residue_bytes", 0),
         }
         fields: dict[str, Any] = {"nonce": spec.pop("nonce", f"{consumer}-{self._id}")}
-        if "wait_timeout_s" in spec:
-            fields["wait_timeout_s"] = spec.pop("wait_timeout_s")
+        for name in spec.keys() & {"wait_timeout_s", "traceparent"}:
+            fields[name] = spec.pop(name)
         wanted = {
             "consumer": consumer,
             "model_id": spec.pop("model_id", consumer),

@@ -3,10 +3,8 @@
 from tests.support.core_driver import CoreDriver
 from tests.support.scenes import held, in_use
 from vram_arbiter.arbiter.core.events import ClientConnected
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ClientId
-
-GIB = d.GIB
 
 
 def test_revoke_is_sent_again_until_acknowledged(driver: CoreDriver) -> None:

@@ -10,9 +10,7 @@ from tests.support.scenes import held
 from vram_arbiter.arbiter.core.learning import CONSUMERS_REMEMBERED
 from vram_arbiter.arbiter.core.model.lease import NONCES_MAX
 from vram_arbiter.arbiter.core.model.state import ENDED_REMEMBERED
-from vram_arbiter.schemas import defaults as d
-
-GIB, MIB = d.GIB, d.MIB
+from vram_arbiter.schemas.defaults import GIB
 
 
 def sizes(owner: object) -> dict[str, int]:

@@ -15,10 +15,9 @@ from vram_arbiter.arbiter.core.invariants import InvariantViolation
 from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState, Use
 from vram_arbiter.arbiter.core.model.state import Core
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, Token, UseId
 
-GIB = d.GIB
 X = ProcessKey(5, 5)
 
 

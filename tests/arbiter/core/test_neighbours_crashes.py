@@ -7,9 +7,7 @@ from tests.support.core_driver import Consumer, CoreDriver, refusal
 from tests.support.scenes import held
 from vram_arbiter.arbiter.core.effects import Effect, Refuse
 from vram_arbiter.arbiter.core.learning import FORGOTTEN_S, NAMES_MAX, PAUSE_MAX_S
-from vram_arbiter.schemas import defaults as d
-
-GIB = d.GIB
+from vram_arbiter.schemas.defaults import GIB
 
 
 def refusals_in(effects: list[Effect]) -> list[Refuse]:

@@ -8,9 +8,9 @@ from tests.support.scenes import held
 from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed
 from vram_arbiter.arbiter.core.verification.judge import DYING_S
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import ProcessKey
 
-GIB, MIB = d.GIB, d.MIB
 BROWSER = ProcessKey(9, 9)
 
 

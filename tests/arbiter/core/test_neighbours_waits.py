@@ -5,9 +5,7 @@ import pytest
 
 from tests.support.core_driver import CoreDriver, answer
 from tests.support.scenes import held
-from vram_arbiter.schemas import defaults as d
-
-GIB, MIB = d.GIB, d.MIB
+from vram_arbiter.schemas.defaults import GIB, MIB
 
 
 # -- 3: stuck for ever

@@ -10,9 +10,9 @@ from vram_arbiter.arbiter.core.ledger import GpuLedger
 from vram_arbiter.arbiter.core.model.gpu import PendingFree
 from vram_arbiter.arbiter.core.settings import GpuInfo
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 
-GIB, MIB = d.GIB, d.MIB
 GPU = GpuId("GPU-0")
 A, B = ProcessKey(1, 7), ProcessKey(2, 14)
 STRANGER = ProcessKey(9, 9)

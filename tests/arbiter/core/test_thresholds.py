@@ -9,9 +9,9 @@ from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.scenes import held
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessDied, ProcessUse, Resumed
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
-GIB, MIB = d.GIB, d.MIB
 TOLERANCE = d.VERIFY_TOLERANCE_BYTES
 BUDGET = 8 * GIB - d.RESERVE_BYTES
 

@@ -9,11 +9,9 @@ from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.scenes import give_back, held, in_use, order
 from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.arbiter.core.model.lease import LeaseState
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.pushes import RevokePush, RevokeWithdrawnPush
-
-GIB = d.GIB
 
 
 def revoked_in_use(

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import START_S, CoreDriver
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.eventlog import replay as runner
 from vram_arbiter.arbiter.eventlog import writer as module
@@ -18,9 +19,7 @@ from vram_arbiter.arbiter.eventlog.logfile import FOLDER, LogError, header_line
 from vram_arbiter.arbiter.eventlog.snapshot import to_plain
 from vram_arbiter.arbiter.eventlog.writer import Recorder
 from vram_arbiter.schemas import defaults as d
-
-PATIENCE_S = 60.0
-KIB = d.KIB
+from vram_arbiter.schemas.defaults import KIB
 
 
 class Recorded:

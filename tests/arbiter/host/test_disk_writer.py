@@ -6,9 +6,9 @@ from collections.abc import Awaitable, Callable, Sequence
 
 import pytest
 
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.arbiter.host.disk_writer import DiskBehind, DiskFailed, DiskWriter
 
-PATIENCE_S = 60.0
 ITEMS_MAX = 10
 
 

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import pytest
 
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.arbiter.host import history as module
 from vram_arbiter.arbiter.host.history import (
     CLEAN_END,
@@ -20,8 +21,6 @@ from vram_arbiter.arbiter.host.history import (
     History,
 )
 from vram_arbiter.schemas.wire.replies import HistoryReply
-
-PATIENCE_S = 60.0
 
 
 def with_history(

@@ -10,6 +10,7 @@ from collections.abc import Awaitable, Callable, Set
 
 import pytest
 
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.host.gpu.probe import GpuDevice, Reading
 from vram_arbiter.arbiter.host.prober import Prober, within
@@ -18,7 +19,6 @@ from vram_arbiter.schemas.errors import NoGpu, ProbeFailed
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 
 GPU = GpuId("GPU-1")
-PATIENCE_S = 60.0
 
 
 class ScriptedProbe:

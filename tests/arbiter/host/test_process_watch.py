@@ -9,11 +9,11 @@ from collections.abc import Awaitable, Callable, Iterator
 
 import pytest
 
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.arbiter.host.process_watch import ProcessWatch
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime.procfs import start_ticks
 
-PATIENCE_S = 60.0
 Programs = Callable[[], "subprocess.Popen[bytes]"]
 Died = "asyncio.Queue[ProcessKey]"
 

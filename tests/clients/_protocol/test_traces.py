@@ -4,11 +4,11 @@ it."""
 import asyncio
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tests.support.leases import Spec
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.client import AsyncClient
@@ -20,11 +20,9 @@ from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 from vram_arbiter.schemas.wire.replies import HistoryReply
-from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 PARENT = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
 OTHER = "00-1af7651916cd43dd8448eb211c80319d-c7ad6b7169203332-01"
-Spec = Callable[..., LeaseSpec]
 
 
 def test_a_program_that_does_not_trace_does_not_import_the_api() -> None:

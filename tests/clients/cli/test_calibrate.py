@@ -18,7 +18,7 @@ import pytest
 
 from tests.support.paths import CONFIGS, ROOT
 from tests.support.process import ArbiterProcess
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 from vram_arbiter.arbiter.host.gpu.fake import make_gpu
 from vram_arbiter.clients.calibration import entry as entries
 from vram_arbiter.clients.calibration import model
@@ -29,15 +29,13 @@ from vram_arbiter.clients.cli.calibrate import MODEL, source_of
 from vram_arbiter.clients.cli.main import run_main
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas import fakegpu
-from vram_arbiter.schemas.defaults import VERIFY_TOLERANCE_BYTES
+from vram_arbiter.schemas.defaults import GIB, MIB, VERIFY_TOLERANCE_BYTES
 from vram_arbiter.schemas.errors import ConfigError, NoGpu
 from vram_arbiter.schemas.manifest import load_manifest
 from vram_arbiter.sidecars.images import header
 from vram_arbiter.sidecars.settings import read_footprints
 
-MIB, GIB = 2**20, 2**30
 RATE_HZ = 200.0
-PATIENCE_S = 60.0
 PR_SET_CHILD_SUBREAPER = 36
 
 
@@ -304,7 +302,8 @@ def test_a_model_in_a_sidecar_of_its_own(gpu: Gpu, readings: Path, fake_folder: 
     (fake_folder / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(slow))
     (readings / "rskill.yaml").write_text(MANIFEST)
     sidecar = [
-        sys.executable, f"{ROOT}/tests/sidecars/echo_sidecar.py", str(readings), "--name", "calibrate",
+        sys.executable, f"{ROOT}/tests/sidecars/echo_sidecar.py", str(readings),
+        "--name", "calibrate",
         "--no-arbiter", "--device", gpu.device, "--rskill", str(readings / "rskill.yaml"),
         "--footprint", "1200MiB,1GiB,300MiB",
     ]  # fmt: skip

@@ -15,8 +15,8 @@ from vram_arbiter.clients.cli.demo_report import (
     returned,
     summarise,
 )
+from vram_arbiter.schemas.defaults import GIB
 
-GIB = 1 << 30
 SWITCH = {
     "kind": "switch", "at_wall_s": 103.0, "seq": 4, "consumer": "grab", "switched": True,
     "verified": True,

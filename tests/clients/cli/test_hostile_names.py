@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 from tests.clients.cli import test_text as said
 from vram_arbiter.arbiter import log as telemetry
 from vram_arbiter.clients.cli import demo_display, doctor, replies, text
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.errors import BadState
 from vram_arbiter.schemas.runtime import logging as logs
 from vram_arbiter.schemas.runtime import terminal
 
-GIB = 1 << 30
 HOSTILE = (
     "x\x1b]0;owned\x07\x1b[2J\x9b31m\u202egnp\u2066\u200b\x00\r\n2026 forged "
     "[red]line[/red]\t\udcff"

@@ -7,27 +7,25 @@ import re
 import shutil
 import sys
 from argparse import ArgumentTypeError, Namespace
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
 
-from tests.support.process import ArbiterProcess
+from tests.support.leases import Spec
+from tests.support.process import ArbiterProcess, Make
 from vram_arbiter.clients.cli.mcp import actions, run, server
 from vram_arbiter.clients.sync import Client as Holder
 from vram_arbiter.schemas.codec import from_map
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.wire.replies import HistoryReply, StatusReply
-from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.anyio]
 
 NOBODY = 65534
 READS = {"status", "why", "history"}
-Make = Callable[..., ArbiterProcess]
-Spec = Callable[..., LeaseSpec]
 
 
 def sdk() -> Any:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from tests.support.prepared import start
 from tests.support.process import vramctl
+from tests.support.waiting import PATIENCE_S
 
-PATIENCE_S = 60.0
 COMMANDS = (
     ("vramctl", "status"),
     ("vramctl", "evict", "x", "-r", "y"),

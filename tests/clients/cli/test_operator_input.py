@@ -8,22 +8,19 @@ import grp
 import json
 import os
 import signal
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tests.support.leases import Spec
 from tests.support.process import ArbiterProcess, Finished, vramctl, vramctl_at_once
 from vram_arbiter.clients.cli.main import run_main
 from vram_arbiter.clients.net.diagnose import obstacle
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.errors import CODES
 from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE, RUNTIME_VARIABLE
-from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 pytestmark = pytest.mark.e2e
-Spec = Callable[..., LeaseSpec]
-PATIENCE_S = 60.0
 EVERY_ACTION = (
     ("evict", "x", "-r", "why"), ("pin", "x", "-r", "why"), ("unpin", "x"),
     ("release-dead", "x", "-r", "why"),

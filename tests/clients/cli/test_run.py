@@ -10,25 +10,23 @@ import signal
 import subprocess
 import sys
 import termios
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
 
-from tests.support.leases import view_of
+from tests.support.leases import Spec, view_of
 from tests.support.process import ArbiterProcess, vramctl
 from tests.support.running import Running, running
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients import cuda
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.program import Program
 from vram_arbiter.clients.foreign.run_spec import RunSpec
 from vram_arbiter.clients.foreign.supervisor import Supervisor
 from vram_arbiter.clients.sync import Client
-from vram_arbiter.schemas.wire.spec import LeaseSpec
 
-Spec = Callable[..., LeaseSpec]
-PATIENCE_S = 60.0
 PROGRAM = """
 import signal, sys
 ints = []

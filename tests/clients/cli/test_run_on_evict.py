@@ -13,20 +13,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.leases import view_of
+from tests.support.leases import Spec, view_of
 from tests.support.process import ArbiterProcess, vramctl
 from tests.support.processes import alive
 from tests.support.running import Running, running
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 from vram_arbiter.clients.cli.run import check_gpus
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import GpuView
 
 pytestmark = pytest.mark.e2e
-Spec = Callable[..., LeaseSpec]
-PATIENCE_S = 60.0
 SERVER = (sys.executable, "-m", "tests.support.model_server")
 PROGRAM = (
     "import os, signal, subprocess, sys, time; signal.signal(15, lambda *_: sys.exit(0)); "

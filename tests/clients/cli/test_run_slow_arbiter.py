@@ -12,11 +12,11 @@ import pytest
 
 from tests.support.grants_at_once import GrantsAtOnce
 from tests.support.running import Running, running
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.schemas.errors import LeaseLost
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
-WAIT_S = 60.0
 PROGRAM = (
     "import signal, sys; signal.signal(15, lambda *_: sys.exit(5)); print('up', flush=True); "
     "signal.pause()"
@@ -39,7 +39,7 @@ async def test_a_signal_reaches_the_program_although_the_arbiter_has_not_heard_t
     program stayed without a lease."""
     arbiter = GrantsAtOnce(ready=None)
     async with (
-        asyncio.timeout(WAIT_S),
+        asyncio.timeout(PATIENCE_S),
         arbiter.serving() as endpoint,
         vramctl_run(endpoint) as run,
     ):
@@ -52,7 +52,7 @@ async def test_a_program_whose_lease_is_gone_when_it_has_started_is_waited_for()
     to it."""
     arbiter = GrantsAtOnce(ready=LeaseLost("L1-1 expired"))
     async with (
-        asyncio.timeout(WAIT_S),
+        asyncio.timeout(PATIENCE_S),
         arbiter.serving() as endpoint,
         vramctl_run(endpoint) as run,
     ):

@@ -25,6 +25,7 @@ from textual.pilot import Pilot
 from textual.widgets import Static
 
 from tests.support.process import ArbiterProcess, vramctl
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.cli.top import feed as feeds
 from vram_arbiter.clients.cli.top import gpus
 from vram_arbiter.clients.cli.top.app import Top
@@ -40,7 +41,6 @@ from vram_arbiter.schemas.wire.requests import Acquire
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 from vram_arbiter.schemas.wire.views import DemandView
 
-DEADLINE_S = 60.0
 STRANGER = 65534
 HOSTILE = "x\x1b[2J\u202e\r\n名前" * 20
 
@@ -92,7 +92,7 @@ async def top(endpoint: str, width: int = 80, height: int = 24) -> AsyncIterator
 
 
 async def until_shown(pilot: Pilot[None], true: Callable[[], bool]) -> None:
-    with anyio.fail_after(DEADLINE_S):
+    with anyio.fail_after(PATIENCE_S):
         while not true():
             await pilot.pause(0.01)
 
@@ -259,12 +259,12 @@ def test_the_program_on_a_terminal_without_color(arbiter_daemon: ArbiterProcess)
     shown, asked = b"", False
     try:
         with contextlib.suppress(OSError):  # the other side is closed: it has ended
-            while select.select([master], [], [], DEADLINE_S)[0]:
+            while select.select([master], [], [], PATIENCE_S)[0]:
                 shown += os.read(master, 65_536)
                 if b"no leases" in shown and not asked:
                     asked = True
                     os.write(master, b"q")
-        assert process.wait(DEADLINE_S) == 0
+        assert process.wait(PATIENCE_S) == 0
     finally:
         process.kill()
         process.wait()

@@ -9,13 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.leases import Spec
 from tests.support.process import ArbiterProcess, vramctl, vramctl_at_once
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.sync import Client
-from vram_arbiter.schemas.wire.spec import LeaseSpec
 
-Spec = Callable[..., LeaseSpec]
 Finished = subprocess.CompletedProcess[str]
-PATIENCE_S = 60.0
 
 
 @pytest.fixture

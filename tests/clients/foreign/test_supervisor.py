@@ -2,23 +2,21 @@
 
 import asyncio
 import signal
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
 import pytest
 
 from tests.support.grants_at_once import GrantsAtOnce
+from tests.support.leases import Spec, Until
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.foreign.program import Program
 from vram_arbiter.clients.foreign.run_spec import OnRevoke, RunSpec
 from vram_arbiter.clients.foreign.supervisor import Supervisor
-from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
-PATIENCE_S = 60.0
-Spec = Callable[..., LeaseSpec]
-Until = Callable[[Callable[[], bool]], Awaitable[None]]
 
 
 class Notes:

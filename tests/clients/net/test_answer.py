@@ -16,6 +16,7 @@ import pytest
 
 from tests.support import protocol_wire
 from tests.support.running import running
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.answer import Answer
 from vram_arbiter.clients.net.server import Peer, RouterServer
@@ -24,7 +25,6 @@ from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.reasoner import server as reasoner
 from vram_arbiter.schemas.plain import Message
 
-PATIENCE_S = 60.0
 LIMIT_S = 0.5
 STOPPED_LIMIT_S = 3.0
 """Of a process of its own, which a busy machine may hold up before and after it is stopped, too."""

@@ -21,6 +21,7 @@ import pytest
 
 from tests.support.paths import SUPPORT
 from tests.support.process import ArbiterProcess, vramctl
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.cli.replies import UNREACHABLE
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net import request
@@ -36,7 +37,6 @@ pytestmark = pytest.mark.skipif(
 )
 
 SCRIPT = SUPPORT / "false_server.py"
-DEADLINE_S = 60.0
 Heard = Callable[[], list[str]]
 
 
@@ -172,7 +172,7 @@ def test_a_lease_is_not_told_to_a_server_that_took_the_arbiters_place(
             caplog.at_level(logging.ERROR, "vram_arbiter.clients.client"),
             false_server(arbiter_daemon.runtime, "arbiter.sock") as heard,
         ):
-            deadline = time.monotonic() + DEADLINE_S
+            deadline = time.monotonic() + PATIENCE_S
             while not any("is served by uid" in record.getMessage() for record in caplog.records):
                 assert time.monotonic() < deadline
                 time.sleep(0.01)

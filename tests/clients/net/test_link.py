@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 import zmq
 
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.net.link import Link
-
-DEADLINE_S = 60.0
 
 
 @pytest.fixture
@@ -24,7 +23,7 @@ def context() -> Iterator["zmq.Context[zmq.Socket[bytes]]"]:
 def bound(context: "zmq.Context[zmq.Socket[bytes]]", path: Path) -> "zmq.Socket[bytes]":
     server = context.socket(zmq.ROUTER)
     server.bind(f"ipc://{path}")
-    server.setsockopt(zmq.RCVTIMEO, int(1000 * DEADLINE_S))
+    server.setsockopt(zmq.RCVTIMEO, int(1000 * PATIENCE_S))
     return server
 
 
@@ -36,19 +35,19 @@ def test_the_last_words_before_a_hang_up_are_heard(
     server = bound(context, tmp_path / "s")
     link = Link(context, f"ipc://{tmp_path}/s", "runner")
     try:
-        assert link.wait(time.monotonic() + DEADLINE_S) == "open"
+        assert link.wait(time.monotonic() + PATIENCE_S) == "open"
         assert link.send(b"question")
         peer, _ = server.recv_multipart()
         server.send_multipart([peer, b"earlier"])
-        assert link.socket.poll(1000 * DEADLINE_S)
+        assert link.socket.poll(1000 * PATIENCE_S)
         assert [link.receive(), link.receive()] == [b"earlier", None]
         server.send_multipart([peer, b"first"])
         server.send_multipart([peer, b"last"])
         server.close()
-        assert link.monitor.poll(1000 * DEADLINE_S)
+        assert link.monitor.poll(1000 * PATIENCE_S)
         with contextlib.closing(Link(context, f"ipc://{tmp_path}/none", "runner")) as later:
             # libzmq's thread does one thing after the other: it is through with the hang-up then
-            assert later.wait(time.monotonic() + DEADLINE_S) == "ended"
+            assert later.wait(time.monotonic() + PATIENCE_S) == "ended"
         assert link.advance() == "ended"
         assert [link.receive(), link.receive(), link.receive()] == [b"first", b"last", None]
     finally:
@@ -63,14 +62,14 @@ def test_a_link_is_for_one_server(
     server = bound(context, tmp_path / "s")
     link = Link(context, f"ipc://{tmp_path}/s", "runner")
     try:
-        assert link.wait(time.monotonic() + DEADLINE_S) == "open"
+        assert link.wait(time.monotonic() + PATIENCE_S) == "open"
         server.close(0)
-        assert link.monitor.poll(1000 * DEADLINE_S)
+        assert link.monitor.poll(1000 * PATIENCE_S)
         assert link.send(b"token")  # it does not know yet
         server = bound(context, tmp_path / "s")
         assert link.advance() == "ended"
         again = Link(context, f"ipc://{tmp_path}/s", "runner")
-        assert again.wait(time.monotonic() + DEADLINE_S) == "open"
+        assert again.wait(time.monotonic() + PATIENCE_S) == "open"
         assert again.send(b"hello")
         assert server.recv_multipart()[-1] == b"hello"
         assert not server.poll(0)
@@ -86,7 +85,7 @@ def test_where_nothing_listens_it_ends(
     (tmp_path / "file").touch()
     for name in ("nothing", "file", "\udcff"):
         link = Link(context, f"ipc://{tmp_path}/{name}", "arbiter")
-        assert link.wait(time.monotonic() + DEADLINE_S) == "ended"
+        assert link.wait(time.monotonic() + PATIENCE_S) == "ended"
         link.close()
         link.close()
 
@@ -99,14 +98,14 @@ def test_descriptors_do_not_pile_up(
     def tried(times: int) -> None:
         for _ in range(times):
             link = Link(context, f"ipc://{tmp_path}/nothing", "arbiter")
-            assert link.wait(time.monotonic() + DEADLINE_S) == "ended"
+            assert link.wait(time.monotonic() + PATIENCE_S) == "ended"
             link.close()
 
     def descriptors() -> int:
         return len(os.listdir("/proc/self/fd"))
 
     tried(10)
-    before, deadline = descriptors(), time.monotonic() + DEADLINE_S
+    before, deadline = descriptors(), time.monotonic() + PATIENCE_S
     tried(60)
     while descriptors() > before + 10:  # libzmq's own thread closes them, a moment later
         assert time.monotonic() < deadline, f"{descriptors()} after 70 links, {before} after 10"

@@ -16,6 +16,7 @@ import pytest
 import zmq
 import zmq.asyncio
 
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.net.server import (
     IMAGES_MAX_BYTES,
     WAITING_MAX,
@@ -26,8 +27,6 @@ from vram_arbiter.clients.net.server import (
 from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import ConfigError, VramError
 from vram_arbiter.schemas.plain import Message
-
-WAIT_S = 60.0
 
 
 def refused(error: VramError) -> Message:
@@ -95,7 +94,7 @@ class Client:
 
 def with_server(scenario: Callable[[], Awaitable[None]]) -> None:
     async def bounded() -> None:
-        async with asyncio.timeout(WAIT_S):
+        async with asyncio.timeout(PATIENCE_S):
             await scenario()
 
     asyncio.run(bounded())

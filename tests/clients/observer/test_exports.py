@@ -7,7 +7,7 @@ import re
 import signal
 import socket
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -15,19 +15,17 @@ import pytest
 from tests.support.collector import Collector, ReceivedSpan
 from tests.support.observer import ObserverProcess
 from tests.support.prepared import run
-from tests.support.process import ArbiterProcess
+from tests.support.process import ArbiterProcess, Make
 from tests.support.processes import children
 from tests.support.status_page import EventStream, get, port_of
 from tests.support.waiting import until
 from tests.support.wire import WireClient
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.runtime import procfs
 
 pytestmark = pytest.mark.e2e
-GIB = 1 << 30
 TRACE, PARENT = "c" * 32, "3" * 16
 HERS = f"00-{TRACE}-{PARENT}-01"
-
-Make = Callable[..., ArbiterProcess]
 
 
 @pytest.fixture
@@ -50,21 +48,8 @@ def hand_over(
         client.hello()
         first = client.granted(detector, 5 * GIB)
         assert client.ask("ready", **on(first))["ok"]
-        queued = client.ask(
-            "acquire",
-            nonce=uuid.uuid4().hex,
-            traceparent=traceparent,
-            spec={
-                "consumer": "policy",
-                "model_id": "policy",
-                "ttl_s": 600.0,
-                "footprint": {
-                    "load_peak_bytes": 5 * GIB,
-                    "steady_bytes": 4 * GIB,
-                    "residue_bytes": 0,
-                },
-            },
-        )
+        fields = {"steady_bytes": 4 * GIB, "traceparent": traceparent, "nonce": uuid.uuid4().hex}
+        queued = client.acquire("policy", 5 * GIB, **fields)
         assert queued["state"] == "queued", queued
         revoke = client.push("revoke")
         assert client.ask("unloading", **on(first))["ok"]

@@ -6,10 +6,8 @@ from tests.support.core_driver import CoreDriver
 from tests.support.scenes import held
 from vram_arbiter.clients.observer import figures
 from vram_arbiter.clients.observer.figures import RESIDUES, STOWAWAYS, UNATTRIBUTED
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import ProcessKey
-
-GIB, MIB = d.GIB, d.MIB
 
 
 def shown(driver: CoreDriver) -> tuple[Mapping[str, int], Mapping[str, int], int | None]:

@@ -26,12 +26,11 @@ from vram_arbiter.clients.observer import metrics as observer_metrics
 from vram_arbiter.clients.observer import spans as otel
 from vram_arbiter.clients.observer.metrics import OTHERS, LeaseMetrics
 from vram_arbiter.clients.observer.spans import NotedIds, Spans, context_of
-from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.codec import to_map
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.wire.views import DaemonView
 
-GIB, MIB = d.GIB, d.MIB
 WALL_S = 1.8e9
 TRACE, PARENT = "a" * 32, "1" * 16
 HERS = f"00-{TRACE}-{PARENT}-01"

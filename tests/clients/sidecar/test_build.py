@@ -16,13 +16,13 @@ from tests.sidecars.conftest import MANIFEST, PNG
 from tests.support import prepared
 from tests.support.paths import CONFIGS, ROOT
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.sidecar.build import build, manifest_file, served
 from vram_arbiter.clients.sidecar.perception import DetectorClient, RewardClient, SceneVlmClient
 from vram_arbiter.schemas.errors import ConfigError, SidecarUnavailable
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
-PATIENCE_S = 60.0
 PARENT = """
 import asyncio, sys
 from vram_arbiter.clients.sidecar.build import served

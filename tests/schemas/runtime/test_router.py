@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 import zmq
 
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.connection import OUT_MESSAGES_MAX, Bounds, Connection
 from vram_arbiter.schemas.runtime.router import Router
@@ -29,7 +30,6 @@ GREETING_AND_READY = (
     + bytes(48)
     + (b"\x04)\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER\x08Identity\x00\x00\x00\x00")
 )
-WAIT_S = 60.0
 LIMITS = Bounds(
     message_max_bytes=1 << 20, process_share=1.0, user_share=1.0, handshake_s=30, hello_s=30
 )
@@ -137,7 +137,7 @@ def ask_with_libzmq(
         for option in options:
             peer.setsockopt(option, 1)
         peer.setsockopt(zmq.LINGER, 0)
-        peer.setsockopt(zmq.RCVTIMEO, int(WAIT_S * 1000))
+        peer.setsockopt(zmq.RCVTIMEO, int(PATIENCE_S * 1000))
         peer.connect(f"ipc://{path}")
         answers = []
         for payload in payloads:
@@ -388,7 +388,7 @@ async def test_the_last_answer_arrives_though_the_server_ends_behind_it(path: Pa
         raw = await (await Raw.connect(path)).ready()
         raw.writer.write(encode(bytes(1 << 19)))
         await comes_true(lambda: bool(handler.received_from))
-        ending = asyncio.create_task(router.aclose(WAIT_S))
+        ending = asyncio.create_task(router.aclose(PATIENCE_S))
         assert len(await raw.reader.read(-1)) == 9 + (1 << 19)
         assert next(iter(handler.open.values())).send(b"late") is False
         raw.close()

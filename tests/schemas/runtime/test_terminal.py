@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 
 from tests.support.paths import ROOT
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.schemas.runtime import terminal
 from vram_arbiter.schemas.units import parse_bytes
 
 MANIFEST = ROOT / "tests/schemas/manifest/samples"
 GRAB = ROOT / "configs/rskills/so101-grab/rskill.yaml"
-PATIENCE_S = 60
 BUFFERED = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
 """argparse itself swallows the error of an unbuffered device."""
 

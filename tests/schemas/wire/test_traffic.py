@@ -14,13 +14,13 @@ import pytest
 from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
 from vram_arbiter import schemas
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.wire import requests
 from vram_arbiter.schemas.wire.pushes import PUSHES
 
 jsonschema = pytest.importorskip("jsonschema")
 pytestmark = pytest.mark.e2e
 
-GIB = 1 << 30
 WIRE = json.loads((Path(schemas.__file__).parent / "json/wire.json").read_text("utf-8"))
 ENVELOPE = frozenset({"re", "ok", "epoch"})
 REPLIES = {op: requests.REPLIES[cls] for op, cls in requests.REQUESTS.items()}

@@ -6,9 +6,8 @@ from tests.support.core_driver import CoreDriver, refusal
 from tests.support.scenes import held, in_use, shown
 from vram_arbiter.arbiter.core.effects import Sample
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import GpuId, LeaseId
-
-GIB, MIB = d.GIB, d.MIB
 
 
 def lived(

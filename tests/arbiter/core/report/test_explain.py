@@ -8,11 +8,9 @@ from tests.support.core_driver import CoreDriver
 from tests.support.scenes import held, in_use, shown, why
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.events import Asked
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 from vram_arbiter.schemas.wire.requests import Acquire
-
-GIB, MIB = d.GIB, d.MIB
 
 
 def test_status_shows_holders_first_then_the_queue_in_order(driver: CoreDriver) -> None:

@@ -8,9 +8,8 @@ import pytest
 from tests.support.core_driver import CoreDriver
 from tests.support.scenes import held, in_use
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ProcessKey
-
-GIB = d.GIB
 
 
 def plan(driver: CoreDriver, consumer: str = "w") -> list[dict[str, Any]]:

@@ -8,8 +8,7 @@ from vram_arbiter.arbiter.core.arbiter import DUE_MAX
 from vram_arbiter.arbiter.core.events import Tick
 from vram_arbiter.arbiter.core.report.why import BLOCKERS_MAX, EXPLAINED_MAX
 from vram_arbiter.schemas import defaults as d
-
-GIB = d.GIB
+from vram_arbiter.schemas.defaults import GIB
 
 
 def pages(driver: CoreDriver, limit: int) -> list[list[dict[str, Any]]]:

@@ -11,10 +11,9 @@ from tests.support.scenes import give_back, held, in_use, order, sent_away, show
 from vram_arbiter.arbiter.core.events import ProbeFailed
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 from vram_arbiter.schemas.wire.codes import Wait, Why
-
-GIB, MIB = d.GIB, d.MIB
 
 
 def core_lease(driver: CoreDriver, lease: LeaseId) -> Lease:

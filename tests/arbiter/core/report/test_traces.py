@@ -2,9 +2,8 @@
 
 from tests.support.core_driver import CoreDriver
 from tests.support.scenes import held, sent_away
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 
-GIB = d.GIB
 HERS = f"00-{'a' * 32}-{'1' * 16}-01"
 HIS = f"00-{'b' * 32}-{'2' * 16}-01"
 

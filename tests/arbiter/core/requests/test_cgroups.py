@@ -5,10 +5,9 @@ import pytest
 
 from tests.support.core_driver import CoreDriver, refusal
 from tests.support.scenes import give_back, held
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import GpuId
 
-GIB = d.GIB
 UNIT = "/system.slice/llm.service"
 GPU_0, GPU_1 = GpuId("GPU-0"), GpuId("GPU-1")
 

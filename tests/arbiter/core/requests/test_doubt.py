@@ -5,8 +5,8 @@ from tests.support.core_driver import CoreDriver, answer
 from tests.support.scenes import held, sent_away
 from vram_arbiter.arbiter.core.events import DOUBT_KEY
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 
-GIB = d.GIB
 WAIT_S = d.LEASE_TTL_S + d.FENCE_GRACE_S
 
 

@@ -5,10 +5,9 @@ from typing import Any
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from vram_arbiter.arbiter.core.effects import Refuse
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import LeaseId
 
-GIB = d.GIB
 LIMITS: dict[str, Any] = {
     "waiters_max": 32,
     "uses_per_lease_max": 16,

@@ -10,9 +10,9 @@ from tests.support.scenes import give_back, held, in_use, shown
 from vram_arbiter.arbiter.core.effects import Effect, Note, Signal
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import ProcessKey
 
-GIB, MIB = d.GIB, d.MIB
 BY = "ops (uid 0, pid 7)"
 
 

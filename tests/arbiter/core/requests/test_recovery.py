@@ -15,11 +15,9 @@ from vram_arbiter.arbiter.core.events import (
 )
 from vram_arbiter.arbiter.core.model.records import ResidueRecord
 from vram_arbiter.arbiter.host.records import records_of
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, Token, UseId
 from vram_arbiter.schemas.wire.requests import UseBegin
-
-GIB, MIB = d.GIB, d.MIB
 
 
 def held_with_token(

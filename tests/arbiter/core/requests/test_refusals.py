@@ -9,9 +9,7 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver, refusal
 from tests.support.scenes import held
 from vram_arbiter.arbiter.core.requests.requests import AT_ONCE, PROCESSES_REMEMBERED
-from vram_arbiter.schemas import defaults as d
-
-GIB = d.GIB
+from vram_arbiter.schemas.defaults import GIB
 
 
 @pytest.fixture

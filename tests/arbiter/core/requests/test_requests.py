@@ -11,12 +11,11 @@ from vram_arbiter.arbiter.core.effects import JournalPut, Note, Push, Reply, Sam
 from vram_arbiter.arbiter.core.events import Asked
 from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ClientId, LeaseId, RequestId, Token
 from vram_arbiter.schemas.wire.codes import Block
 from vram_arbiter.schemas.wire.notes import GrantedNote, QueuedNote
 from vram_arbiter.schemas.wire.requests import Acquire
-
-GIB = d.GIB
 
 
 def kinds(effects: list[Any]) -> list[str]:

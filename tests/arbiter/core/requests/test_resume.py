@@ -10,8 +10,8 @@ from vram_arbiter.arbiter.core.effects import Note, Sample
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessDied, Resumed
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.codec import to_map
+from vram_arbiter.schemas.defaults import GIB
 
-GIB = d.GIB
 NIGHT_S = 8 * 3600.0
 
 

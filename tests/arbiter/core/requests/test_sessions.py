@@ -4,10 +4,8 @@ from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.scenes import give_back, held
 from vram_arbiter.arbiter.core.effects import Note, Push, Refuse
 from vram_arbiter.arbiter.core.events import ClientConnected, ClientLeft, JournalFailed, ProcessDied
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
-
-GIB = d.GIB
 
 
 def test_a_first_client_makes_the_gpu_be_read_if_the_reading_is_old(driver: CoreDriver) -> None:

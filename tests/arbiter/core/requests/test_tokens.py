@@ -8,10 +8,9 @@ from typing import Any
 
 from tests.support.core_driver import CoreDriver, answer, refusal
 from vram_arbiter.arbiter.core.effects import Note, Push, Refuse, Reply
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import Token
 
-GIB = d.GIB
 SECRET = "5e" * 16
 
 

@@ -12,9 +12,9 @@ from vram_arbiter.arbiter.core.effects import Effect, JournalPut, Reply
 from vram_arbiter.arbiter.core.events import ProcessDied, Resumed
 from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import LeaseId, Token
 
-GIB, MIB = d.GIB, d.MIB
 PATIENCE_S = d.LEASE_TTL_S + d.FENCE_GRACE_S
 
 

@@ -9,10 +9,8 @@ from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.engine_state import state_of
 from tests.support.scenes import give_back, held
 from vram_arbiter.arbiter.core.scheduling.victims import Choice
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import LeaseId
-
-GIB = d.GIB
 
 
 def asked(driver: CoreDriver, leases: dict[str, LeaseId]) -> list[str]:

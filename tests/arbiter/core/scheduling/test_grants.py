@@ -8,9 +8,9 @@ from tests.support.scenes import give_back, held, in_use
 from vram_arbiter.arbiter.core.effects import Sample
 from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 
-GIB, MIB = d.GIB, d.MIB
 STRANGER = ProcessKey(9, 9)
 
 

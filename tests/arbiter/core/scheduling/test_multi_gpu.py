@@ -8,10 +8,9 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.scenes import give_back, held, in_use, place
 from vram_arbiter.arbiter.core.events import ProcessDied
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import GpuId, LeaseId
 
-GIB = d.GIB
 ZERO, ONE = GpuId("GPU-0"), GpuId("GPU-1")
 GPUS = 2
 

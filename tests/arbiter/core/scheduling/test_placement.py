@@ -8,10 +8,9 @@ import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer
 from tests.support.scenes import held, place
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import GpuId, LeaseId
 
-GIB = d.GIB
 ZERO, ONE = GpuId("GPU-0"), GpuId("GPU-1")
 
 

@@ -10,10 +10,9 @@ from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import LeaseId
 from vram_arbiter.schemas.wire.codes import Block
-
-GIB, MIB = d.GIB, d.MIB
 
 
 class Scene:

@@ -7,10 +7,9 @@ import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.scenes import give_back
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
-GIB, MIB = d.GIB, d.MIB
 STRANGER = ProcessKey(9, 9)
 
 

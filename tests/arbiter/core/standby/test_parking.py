@@ -9,10 +9,9 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.scenes import give_back, held, shown
 from vram_arbiter.arbiter.core.ledger import HostRam
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import LeaseId
 
-GIB, MIB = d.GIB, d.MIB
 RESIDUE = 450 * MIB
 
 

@@ -8,11 +8,8 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.scenes import give_back, held, in_use, revoked, sent_away, shown
 from vram_arbiter.arbiter.core.events import ProcessDied
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
-
-GIB = d.GIB
-MIB = d.MIB
 
 
 # -- there and back

@@ -7,9 +7,7 @@ import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.scenes import give_back, held, order, revoked, sent_away
-from vram_arbiter.schemas import defaults as d
-
-GIB = d.GIB
+from vram_arbiter.schemas.defaults import GIB
 
 
 # -- ends

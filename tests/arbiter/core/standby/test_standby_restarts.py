@@ -5,11 +5,9 @@ from tests.support.scenes import held, revoked, sent_away, shown
 from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.arbiter.core.events import ClientConnected, Recovered
 from vram_arbiter.arbiter.host.records import records_of
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ClientId, Token
 from vram_arbiter.schemas.wire.pushes import GrantedPush
-
-GIB = d.GIB
 
 
 def test_a_restart_keeps_it_and_waits_for_its_holder(driver: CoreDriver) -> None:

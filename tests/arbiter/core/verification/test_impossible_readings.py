@@ -10,9 +10,9 @@ from tests.support.core_driver import CoreDriver
 from tests.support.scenes import held
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ProcessKey
 
-GIB = d.GIB
 LIES: list[dict[str, Any]] = [
     {"used_bytes": -1},
     {"used_bytes": 9 * GIB},

@@ -5,10 +5,9 @@ import pytest
 from tests.support.core_driver import CoreDriver
 from tests.support.scenes import held
 from vram_arbiter.arbiter.core.events import ProcessDied
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ProcessKey
 
-GIB = d.GIB
 CHILD = ProcessKey(4000, 1)
 
 

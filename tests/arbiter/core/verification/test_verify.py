@@ -10,9 +10,9 @@ from tests.support.scenes import give_back, held, verdicts
 from vram_arbiter.arbiter.core.effects import Sample
 from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed, Tick
 from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 
-GIB, MIB = d.GIB, d.MIB
 STRANGER = ProcessKey(9, 9)
 GPU = GpuId("GPU-0")
 

@@ -10,10 +10,9 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.scenes import give_back, held, hidden_gpu, verdicts
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
-GIB, MIB = d.GIB, d.MIB
 BROWSER = ProcessKey(9, 9)
 
 

@@ -6,14 +6,13 @@ import threading
 
 import pytest
 
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_gpu, open_gpus
 from vram_arbiter.schemas import fakegpu
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
 from vram_arbiter.schemas.ids import GpuId
 from vram_arbiter.schemas.runtime.fakegpu_folder import locked
-
-GIB = 2**30
-PATIENCE_S = 60.0
 
 
 def edit(gpu_folder, **changes):

@@ -10,17 +10,16 @@ from typing import Any
 import pytest
 
 from tests.support.nvml_stub import GIB, MIB, NvmlStub
-from tests.support.process import ArbiterProcess
+from tests.support.process import ArbiterProcess, Make
+from tests.support.waiting import PATIENCE_S
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 pytest.importorskip("pynvml")
 ME = os.getpid()
-PATIENCE_S = 60.0
 CONFIG = "probe: {deadline_s: 60.0, period_s: 0.1}\nverify: {timeout_s: 3.0, slow_poll_s: 0.1}\n"
 HANGS = CONFIG.replace("deadline_s: 60.0", "deadline_s: 0.4")
 """A busy machine misses this deadline now and then, too."""
-Make = Callable[..., ArbiterProcess]
 
 
 @pytest.fixture

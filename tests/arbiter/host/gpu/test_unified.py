@@ -25,11 +25,11 @@ from vram_arbiter.arbiter.host.gpu.unified import (
 from vram_arbiter.arbiter.host.journal import Opened
 from vram_arbiter.arbiter.settings import budget, core_settings
 from vram_arbiter.schemas.config.arbiter import load_config
+from vram_arbiter.schemas.defaults import KIB
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
 from vram_arbiter.schemas.ids import GpuId
 
 MACHINES = Path(__file__).with_name("machines")
-KIB = 2**10
 PIDS = PidMap("own")
 
 

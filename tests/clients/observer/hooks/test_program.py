@@ -4,20 +4,17 @@ again."""
 import json
 import os
 import signal
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tests.support.leases import Spec
 from tests.support.observer import ObserverProcess, config_file
 from tests.support.prepared import run
 from tests.support.process import ArbiterProcess, Finished, vramctl
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 from vram_arbiter.clients.sync import Client
-from vram_arbiter.schemas.wire.spec import LeaseSpec
 
-Spec = Callable[..., LeaseSpec]
-PATIENCE_S = 60.0
 RULES = """
 http: {{listen: null}}
 hooks:

@@ -7,14 +7,13 @@ from typing import Any
 
 import pytest
 
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.feed import Cursor
 from vram_arbiter.clients.observer.hooks.events import Delivery
 from vram_arbiter.clients.observer.hooks.queues import Runner, Saved, StateFile
 from vram_arbiter.schemas.config.observer import Hook
 from vram_arbiter.schemas.errors import ActionFailed, AlreadyRunning, ConfigError
 from vram_arbiter.schemas.wire.replies import HistoryReply
-
-PATIENCE_S = 60.0
 
 
 def reply(numbering: str, *seqs: int, last: int = 0) -> HistoryReply:

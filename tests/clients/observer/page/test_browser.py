@@ -1,4 +1,5 @@
-"""The status page in a real headless Chromium, over a daemon with a moving scene."""
+"""The status page in a real headless Chromium, over a daemon with a moving scene. What it shows and
+filters is tried in every run of the tests, the rest at night."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from tests.support.process import ArbiterProcess
 from tests.support.status_page import get, port_of
 from tests.support.waiting import until
 from tests.support.wire import WireClient
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.runtime.ports import free_port
 
 if TYPE_CHECKING:
@@ -25,7 +27,6 @@ pytestmark = [
         reason="needs Debian's chromium and chromium-driver (.ci/setup full installs them as root)",
     ),
 ]
-GIB = 1 << 30
 SHOWN_S = 60.0
 NAME = "<script>window.harm=1</script>"
 FLAGS = (
@@ -198,6 +199,7 @@ def test_history_is_filtered(page: Page) -> None:
     pick("#consumer", "")
 
 
+@pytest.mark.nightly
 def test_the_keyboard_reaches_everything_in_order_and_all_has_a_name(page: Page) -> None:
     from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys
@@ -225,6 +227,7 @@ def test_the_keyboard_reaches_everything_in_order_and_all_has_a_name(page: Page)
         assert page.run(f"document.querySelector({landmark!r}) !== null")
 
 
+@pytest.mark.nightly
 def test_terms_are_explained_on_focus_and_under_the_pointer(page: Page) -> None:
     """The page named charged, reserve, quiesce and tier, and only the documentation said what they
     are. A change of the GPU keeps the focus and its explanation; Escape hides it."""
@@ -257,6 +260,7 @@ def test_terms_are_explained_on_focus_and_under_the_pointer(page: Page) -> None:
     page.client.ask("release", lease_id=granted["lease_id"], token=granted["token"])
 
 
+@pytest.mark.nightly
 def test_dark_light_and_a_phone(page: Page) -> None:
     light, dark = page.colors("light"), page.colors("dark")
     assert light != dark
@@ -268,6 +272,7 @@ def test_dark_light_and_a_phone(page: Page) -> None:
     page.colors("light")
 
 
+@pytest.mark.nightly
 def test_a_page_without_its_daemon_says_since_when_and_comes_back(
     page: Page, shown_arbiter: ArbiterProcess
 ) -> None:

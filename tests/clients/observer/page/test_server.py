@@ -26,10 +26,10 @@ from vram_arbiter.clients.observer.page.server import (
     STREAMS_PER_PEER,
 )
 from vram_arbiter.schemas import strictjson
+from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.urls import HttpAddress
 
 pytestmark = pytest.mark.e2e
-MIB = 1 << 20
 NAME = "<script>alert(1)</script>"
 WHOLE = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
 HALF = b"GET / HTTP/1.1\r\nHost: "

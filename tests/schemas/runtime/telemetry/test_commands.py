@@ -13,6 +13,7 @@ import pytest
 
 from tests.support.collector import Collector
 from tests.support.paths import ROOT
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.cli.main import main as vramctl
 from vram_arbiter.reasoner.__main__ import main as reasoner
 from vram_arbiter.runner.__main__ import main as runner
@@ -24,7 +25,6 @@ from vram_arbiter.schemas.runtime.telemetry.commands import Command, command
 pytestmark = pytest.mark.heavy  # the OpenTelemetry SDK
 
 TRACE, PARENT = "0af7651916cd43dd8448eb211c80319c", "b7ad6b7169203331"
-WAIT_S = 60.0
 PROGRAMS = {"vramctl": vramctl, "vram-runner": runner, "vram-reasoner": reasoner}
 
 
@@ -125,7 +125,7 @@ def test_sigterm_loses_nothing_and_the_trace_is_the_starters() -> None:
         assert process.stdout is not None
         assert process.stdout.readline() == "up\n"
         process.send_signal(signal.SIGTERM)
-        process.communicate(timeout=WAIT_S)
+        process.communicate(timeout=PATIENCE_S)
         (span,) = collector.spans(telemetry.SPAN_COMMAND)
     assert process.returncode == span.attributes[telemetry.ATTR_EXIT_CODE] == 128 + signal.SIGTERM
     assert (span.service, span.trace_id, span.parent_id) == ("tool", TRACE, PARENT)
@@ -136,7 +136,7 @@ def test_nobody_asked_nothing_is_imported_or_changed() -> None:
         "print([name for name in sys.modules if name.startswith('opentelemetry')],"
         " signal.getsignal(signal.SIGTERM) is signal.SIG_DFL, threading.active_count())"
     )
-    assert process.communicate(timeout=WAIT_S) == ("[] True 1\n", "")
+    assert process.communicate(timeout=PATIENCE_S) == ("[] True 1\n", "")
 
 
 @pytest.mark.parametrize(
