@@ -9,7 +9,6 @@ arbiter's history and the GPU's own log, which an independent checker reads.
 import asyncio
 import json
 import os
-import sys
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import AsyncExitStack
 from typing import Any
@@ -30,6 +29,7 @@ from tests.e2e.episode_stage import (
 )
 from tests.runner.small_robots import robot_of
 from tests.support.chat_server import chat_server
+from tests.support.prepared import run
 from vram_arbiter.clients.cli.replies import UNREACHABLE
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.runner.protocols import Goal
@@ -57,15 +57,12 @@ async def done(stage: Stage) -> None:
     for _ in range(
         20
     ):  # an operator asks again where nobody answered in the seconds that he is made to wait
-        shown = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "vram_arbiter.clients", "status",
-            env=stage.programs.arbiter.environ, stdout=asyncio.subprocess.PIPE
-        )  # fmt: skip
-        said = (await shown.communicate())[0].decode()
+        environ = stage.programs.arbiter.environ
+        shown = await asyncio.to_thread(run, "vramctl", ["status"], environ, WAIT_S)
         if shown.returncode != UNREACHABLE:
             break
-    (line,) = [line for line in said.splitlines() if " detector " in line]
-    assert " standby " in line, said
+    (line,) = [line for line in shown.stdout.splitlines() if " detector " in line]
+    assert " standby " in line, shown
     why = (await stage.arbiter.why("detector")).leases[0].text
     assert why == "detector: on standby until policy has left"
     assert stage.detector_was_away()
@@ -214,19 +211,6 @@ async def runner_killed(stage: Stage) -> None:
     await stage.detector_is_back()
 
 
-@pytest.mark.parametrize(
-    "end",
-    [done, failed, canceled, rejected, past_its_deadline, load_failed, out_of_memory,
-    canceled_while_loading, policy_killed, reasoner_killed,
-     runner_killed],
-    ids=lambda end: end.__name__,
-)  # fmt: skip
-def test_after_a_goal_the_detector_is_back_by_itself(
-    episode_programs: Programs, end: Callable[[Stage], Coroutine[Any, Any, None]]
-) -> None:
-    assert episode_programs.play(end) == []
-
-
 async def called_back(stage: Stage) -> None:
     """Of a policy that is on standby itself: its lease waits to come back, behind a look, when its
     goal is over."""
@@ -274,6 +258,8 @@ def test_a_policy_is_called_back_from_standby_only_as_long_as_its_goal_wants_it(
 
 # -- while it runs
 async def wanted_meanwhile(stage: Stage) -> None:
+    """Nobody is made to leave in the middle of a step; the look that was wanted comes with the
+    goal's end."""
     goal = await stage.goal_under_way()
     with pytest.raises(WaitTimeout):
         await stage.detector.load(timeout_s=0.2)
@@ -286,15 +272,8 @@ async def wanted_meanwhile(stage: Stage) -> None:
     assert await stage.leases() == {"detector": "held"}
 
 
-def test_who_wants_to_look_in_the_middle_of_a_goal_is_told_to_wait(
-    episode_programs: Programs,
-) -> None:
-    """Nobody is made to leave in the middle of a step; the look that was wanted comes with the
-    goal's end."""
-    assert episode_programs.play(wanted_meanwhile) == []
-
-
 async def one_after_the_other(stage: Stage) -> None:
+    """The next goal, with other words, loads nothing and lets nothing back in between."""
     np = pytest.importorskip("numpy")
     stage.programs.tell("hold", True)
     async with AsyncExitStack() as stack:
@@ -320,13 +299,8 @@ async def one_after_the_other(stage: Stage) -> None:
     await stage.detector_is_back(after="ready")
 
 
-def test_the_next_goal_with_other_words_loads_nothing_and_lets_nothing_back_in_between(
-    episode_programs: Programs,
-) -> None:
-    assert episode_programs.play(one_after_the_other) == []
-
-
 async def without_a_gpu(stage: Stage) -> None:
+    """A goal without a GPU sends nobody away."""
     before = await stage.detector.ping(timeout_s=WAIT_S)
     goal = await stage.runner.send_goal(
         "vram-arbiter/so101-navigate", goal_params={"turn_rad": 0.1}
@@ -336,11 +310,8 @@ async def without_a_gpu(stage: Stage) -> None:
     assert (await stage.detector.ping(timeout_s=WAIT_S))["token"] == before["token"]
 
 
-def test_a_goal_without_a_gpu_sends_nobody_away(episode_programs: Programs) -> None:
-    assert episode_programs.play(without_a_gpu) == []
-
-
 async def slow_start(stage: Stage) -> None:
+    """No goal runs before its policy is ready."""
     stage.programs.tell("slow_load", True)
     stage.programs.tell("hold", True)
     goal = await stage.runner.send_goal(SKILL, prompt="hold still", deadline_s=DEADLINE_S)
@@ -363,5 +334,16 @@ async def slow_start(stage: Stage) -> None:
     await stage.detector_is_back()
 
 
-def test_no_goal_runs_before_its_policy_is_ready(episode_programs: Programs) -> None:
-    assert episode_programs.play(slow_start) == []
+ENDS = (
+    done, failed, canceled, rejected, past_its_deadline, load_failed, out_of_memory,
+    canceled_while_loading, policy_killed, reasoner_killed, runner_killed,
+)  # fmt: skip
+MEANWHILE = (wanted_meanwhile, one_after_the_other, without_a_gpu, slow_start)
+
+
+@pytest.mark.parametrize("scenario", [*ENDS, *MEANWHILE], ids=lambda story: story.__name__)
+def test_the_detector_is_away_for_a_goal_and_back_by_itself(
+    episode_programs: Programs, scenario: Callable[[Stage], Coroutine[Any, Any, None]]
+) -> None:
+    """After every end of a goal, and never before."""
+    assert episode_programs.play(scenario) == []

@@ -129,7 +129,7 @@ PROGRAMS: Mapping[str, Program] = {
     "stepper": Program("tests.e2e.stepper", server="neighbour"),
     "script": Program("tests.support.script", server="vramctl"),
     "attacker": Program("tests.support.attacks", server="neighbour"),
-    "storm-worker": Program("tests.chaos.worker", CLIENT),
+    "storm-worker": Program("tests.chaos.worker", server="neighbour"),
     "op-server": Program("tests.support.server_process", server="echo"),
     "dataset-writer": Program("tests.support.dataset_writer", server="vram-sidecar"),
     "dataset-reader": Program("tests.support.dataset_reader", server="vram-sidecar"),

@@ -15,6 +15,7 @@ from vram_arbiter.runner.__main__ import main, parse
 from vram_arbiter.runner.cli.deployment import make_parts, read_deployment
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.manifest import load_manifest
 from vram_arbiter.schemas.runtime.folders import LockFile
 
 pytestmark = pytest.mark.heavy  # the SO-101's kinematics
@@ -325,24 +326,20 @@ def test_the_file_cannot_ask_for_other_weights_than_are_installed(
     assert re.search(rf"robot\.yaml:9: vla\.{field.partition(':')[0]}: .* is not what", err), err
 
 
-@pytest.mark.parametrize(
-    "licence", ["nvidia_non_commercial", "proprietary", "unknown", "permissive_research"]
-)
-def test_a_licence_that_forbids_commercial_use_stops_the_task(
-    dry_run: DryRun, tmp_path: Path, licence: str
+def test_a_licence_that_forbids_commercial_use_stops_the_task_without_a_flag(
+    dry_run: DryRun, tmp_path: Path
 ) -> None:
-    skills = licensed(tmp_path, licence)
-    code, _, err = dry_run(TWIN + GRAB_TASK, skills=skills)
+    text, skills = TWIN + CAMERAS + GRAB_TASK, licensed(tmp_path, "nvidia_non_commercial")
+    code, _, err = dry_run(text, skills=skills)
     assert code == 2
-    assert re.search(rf"robot\.yaml:4: vla\.id: .*{licence}.*--allow-noncommercial", err), err
-
-
-def test_a_licence_may_be_overruled_by_a_flag(dry_run: DryRun, tmp_path: Path) -> None:
-    text = TWIN + CAMERAS + GRAB_TASK
-    skills = licensed(tmp_path, "nvidia_non_commercial")
+    told = r"robot\.yaml:7: vla\.id: .*nvidia_non_commercial.*--allow-noncommercial"
+    assert re.search(told, err), err
     code, out, _ = dry_run(text, "--allow-noncommercial", skills=skills)
     assert code == 0
     assert "so101-grab 0.1.0 (nvidia_non_commercial)" in out
+    for licence in ("proprietary", "unknown", "permissive_research"):
+        other = load_manifest(GRAB).model_copy(update={"license": licence})
+        assert not other.is_commercial_use_allowed
 
 
 def test_serving_goals_offers_only_what_is_licensed_and_fits(

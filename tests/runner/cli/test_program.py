@@ -9,12 +9,12 @@ import os
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import play
 from vram_arbiter.clients.net.link import is_listening
 from vram_arbiter.clients.runner import RunnerClient, RunnerUnreachable
 from vram_arbiter.clients.sidecar.policy import PolicyClient
@@ -26,7 +26,6 @@ from vram_arbiter.schemas.goals import PingRunner
 
 pytestmark = pytest.mark.anyio
 
-Run = Callable[[Any], Any]
 ROOT = Path(__file__).parents[3]
 
 
@@ -49,10 +48,10 @@ def start_runner(tmp_path: Path) -> Iterator[Callable[..., Forked]]:
 
 @pytest.mark.heavy
 @pytest.mark.e2e
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it_in_order_and_the_video_is_whole(
-    start_runner: Callable[..., Forked], tmp_path: Path, run_async: Run, how: signal.Signals
+    start_runner: Callable[..., Forked], tmp_path: Path
 ) -> None:
+    """SIGTERM is that of test_deploy.py."""
     import imageio_ffmpeg
 
     video = tmp_path / "episode.mp4"
@@ -74,22 +73,12 @@ def test_a_signal_ends_it_in_order_and_the_video_is_whole(
             async for feedback in goal.feedback():
                 if feedback["tick_idx"] > 5:
                     break
-            process.send_signal(how)
+            process.send_signal(signal.SIGINT)
             assert (await goal.result(60))["status"] == "canceled"
 
-    run_async_long(use)
+    play(use, 200.0)
     assert process.wait(60) == 0
     assert imageio_ffmpeg.count_frames_and_secs(str(video))[0] > 0
-
-
-def run_async_long(coroutine: Callable[[], Any]) -> None:
-    import asyncio
-
-    async def bounded() -> None:
-        async with asyncio.timeout(200):
-            await coroutine()
-
-    asyncio.run(bounded())
 
 
 @pytest.mark.heavy

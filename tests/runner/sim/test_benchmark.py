@@ -15,8 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from tests.runner.conftest import KinematicEnv, world_of
 from tests.runner.manual_clock import ManualClock
@@ -59,16 +57,6 @@ Run = Callable[[Any], Any]
 )
 def test_wilsons_interval(successes: int, of: int, low: float, high: float) -> None:
     assert wilson(successes, of) == pytest.approx((low, high), abs=5e-5)
-
-
-@pytest.mark.heavy
-@given(st.integers(1, 5000).flatmap(lambda of: st.tuples(st.integers(0, of), st.just(of))))
-def test_the_interval_holds_the_rate_and_mirrors(counts: tuple[int, int]) -> None:
-    successes, of = counts
-    low, high = wilson(successes, of) or (2.0, 2.0)
-    assert 0.0 <= low <= successes / of + 1e-12
-    assert successes / of - 1e-12 <= high <= 1.0
-    assert wilson(of - successes, of) == pytest.approx((1 - high, 1 - low))
 
 
 def test_nothing_played_has_no_rate() -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from tests.runner.small_robots import robot_of
 from tests.sidecars.adapters import policies
-from tests.sidecars.adapters.families import SEED, lerobots_own, manifest_text
+from tests.sidecars.adapters.families import SEED, lerobots_own, manifest_text, swept
 from tests.sidecars.adapters.policies import DIM, FRONT, SIDE_PX, STATE, TASK, WRIST
 from vram_arbiter.runner.protocols import Act, Done, Goal
 from vram_arbiter.runner.skills.sidecar_policy import SidecarPolicy
@@ -56,7 +56,7 @@ class Served:
     async def close(self) -> None: ...
 
 
-@pytest.mark.parametrize("name", ["act", "diffusion", "vqbet", "multi_task_dit", "tdmpc"])
+@pytest.mark.parametrize("name", swept(["act", "diffusion", "vqbet", "multi_task_dit", "tdmpc"]))
 def test_a_goal_plays_what_lerobots_loop_plays(
     tmp_path: Path, run_async: Callable[[Any], Any], name: str
 ) -> None:
