@@ -181,10 +181,17 @@ def find_container(name: str, grace_s: float | None) -> Service:
     _check_name(name, CONTAINER_NAME)
     for engine in filter(shutil.which, ENGINES):
         if (found := _inspected(engine, name)) is not None:
-            grace = () if grace_s is None else (f"--time={ceil(grace_s)}",)
+            cgroup = _cgroup_of(found) or _predicted(engine, found)
+            if found["Id"] not in cgroup:
+                raise ConfigError(
+                    f"the container {name!r} has no cgroup of its own: it runs in {cgroup}",
+                    hint="let its engine make one by systemd (podman: a session of the user, or "
+                    "`loginctl enable-linger`)",
+                )
+            grace = () if grace_s is None else (f"-t{ceil(grace_s)}",)
             return Service(
                 name=name,
-                cgroup=_cgroup_of(found) or _predicted(engine, found),
+                cgroup=cgroup,
                 run=(engine, "start", "--attach", "--", name),
                 stop=(engine, "stop", *grace, "--", name),
                 kill=(engine, "kill", "--", name),
@@ -245,11 +252,12 @@ def _look_at_container(engine: str, name: str) -> tuple[str, int]:
 
 
 def _cgroup_of(found: Mapping[str, Any]) -> str:
-    """Return the cgroup of a running container, which is named by its id, else ""."""
+    """Return the cgroup of a running container, down to the folder that is named by its id; its
+    process's where there is none; "" while it does not run."""
     pid = found["State"]["Pid"]
     parts = procfs.read_cgroup(pid).split("/") if pid else []
     own = [index for index, part in enumerate(parts) if found["Id"] in part]
-    return "/".join(parts[: own[0] + 1]) if own else ""
+    return "/".join(parts[: own[0] + 1] if own else parts)
 
 
 def _predicted(engine: str, found: Mapping[str, Any]) -> str:

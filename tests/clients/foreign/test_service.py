@@ -58,8 +58,8 @@ def unit(tools: Path, name: str = "llm.service", slice_: str = "system.slice") -
     (tools / f"{name}.shown").write_text(text)
 
 
-def add_container(tools: Path, engine: str, **host: str) -> None:
-    told = [{"Id": IDENTITY, "State": {"Pid": 0}, "HostConfig": host}]
+def add_container(tools: Path, engine: str, pid: int = 0, **host: str) -> None:
+    told = [{"Id": IDENTITY, "State": {"Pid": pid}, "HostConfig": host}]
     (tools / f"{engine}.llm").write_text(json.dumps(told))
 
 
@@ -105,7 +105,7 @@ def test_the_cgroup_of_a_container_that_does_not_run_is_known_by_its_engine(
     add_container(tools, engine, **host)
     found = find_container("llm", 1.5)
     assert found.cgroup == cgroup
-    assert found.stop == (engine, "stop", "--time=2", "--", "llm")
+    assert found.stop == (engine, "stop", "-t2", "--", "llm")
 
 
 def test_the_cgroup_of_a_container_that_runs_is_its_process_s(tools: Path) -> None:
@@ -130,6 +130,18 @@ def test_the_cgroup_of_a_container_that_runs_is_its_process_s(tools: Path) -> No
     finally:
         own.joinpath("init").rmdir()
         own.rmdir()
+
+
+@pytest.mark.skipif(not procfs.read_cgroup(os.getpid()), reason="no cgroup v2 hierarchy")
+def test_a_container_without_a_cgroup_of_its_own_gets_no_lease(tools: Path) -> None:
+    """Regression: rootless podman without systemd makes none, and the container ran on beside its
+    lease, as a stowaway. One that runs is refused, one that was started there is ended."""
+    add_container(tools, "podman", CgroupManager="cgroupfs")
+    found = find_container("llm", None)
+    add_container(tools, "podman", os.getpid(), CgroupManager="cgroupfs")
+    assert found.look()[0] == procfs.read_cgroup(os.getpid())
+    with pytest.raises(ConfigError, match="'llm' has no cgroup of its own"):
+        find_container("llm", None)
 
 
 @pytest.mark.parametrize("name", ["", "-x", "a b", "a/b", "a\n", "x" * 256])
