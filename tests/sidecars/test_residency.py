@@ -5,6 +5,7 @@ import asyncio
 
 import pytest
 
+from tests.sidecars.conftest import MANIFEST
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.errors import Evicted, ModelError, NotPermitted, NotResident
 from vram_arbiter.schemas.manifest import parse_manifest
@@ -18,18 +19,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
 GB = 10**9
 WAIT_S = 60.0
-MANIFEST = """
-name: test/eye
-version: 0.1.0
-kind: detector
-embodiment_tags: [any]
-chunk_size: 1
-weights_uri: hf://test/eye
-description: sees nothing
-latency_budget: {per_chunk_ms: 100}
-actions: [detect]
-detector: {labels: [cube]}
-"""
 
 
 class Model:
@@ -110,7 +99,7 @@ class Client(AsyncClient):
 
 def settings(daemon):
     footprint = Footprint(load_peak_bytes=GB, steady_bytes=GB, residue_bytes=GB // 10)
-    manifest = parse_manifest(MANIFEST)
+    manifest = parse_manifest(MANIFEST.format(name="eye"))
     return Settings(
         "eye", manifest, Weights("test/eye", local=False), footprint, "ipc://nobody",
         f"fake:{daemon.gpu_folder}", daemon.endpoint
