@@ -9,6 +9,7 @@ from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
+from tests.sidecars.conftest import MANIFEST
 from tests.support.fakegpu_check import check_log
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
@@ -28,19 +29,7 @@ GB = 10**9
 DETECTOR_BYTES, POLICY_BYTES, CONTEXT_BYTES = 5 * GB, 4 * GB, GB // 10
 JOINTS = "[shoulder_pan, shoulder_lift, elbow_flex, wrist_flex, wrist_roll, gripper]"
 MANIFESTS = {
-    "detector": """
-name: test/arm-detector
-version: 0.1.0
-license: mit
-kind: detector
-embodiment_tags: [any]
-chunk_size: 1
-weights_uri: hf://test/detector
-description: sees nothing
-latency_budget: {per_chunk_ms: 100}
-actions: [detect]
-detector: {labels: [cube]}
-""",
+    "detector": MANIFEST.format(name="arm-detector"),
     "policy": f"""
 name: {SKILL}
 version: 0.1.0

@@ -20,6 +20,7 @@ import yaml
 
 pytest.importorskip("prometheus_client", reason="the extra `telemetry`")
 
+from tests.sidecars.conftest import MANIFEST
 from tests.support import promql
 from tests.support.chat_server import chat_server
 from tests.support.collector import Collector, ReceivedSpan
@@ -40,19 +41,6 @@ GRAB = ROOT / "configs/rskills/so101-grab"
 START_S, MOVES_S = 90.0, 120.0
 ARBITER, RUNNER, REASONER = "vram-arbiter", "vram-runner", "vram-reasoner"
 DETECTOR, POLICY = "vram-sidecar-detector", "vram-sidecar-grab"
-DETECTOR_MANIFEST = """
-name: test/detector
-version: 0.1.0
-license: mit
-kind: detector
-embodiment_tags: [any]
-chunk_size: 1
-weights_uri: hf://test/detector
-description: sees nothing
-latency_budget: {per_chunk_ms: 100}
-actions: [detect]
-detector: {labels: [cube]}
-"""
 DECISIONS = (
     ("locate_in_view", {"query": "red cube"}),
     ("execute_rskill__vram-arbiter__so101-grab", {"prompt": "grab the red cube"}),
@@ -101,7 +89,7 @@ def run_programs(
     arbiter: ArbiterProcess, programs: Programs, collector: Collector, folder: Path
 ) -> list[int]:
     """Start the programs, let the arm move, end them. Their exit codes, the last started first."""
-    (folder / "rskill.yaml").write_text(DETECTOR_MANIFEST)
+    (folder / "rskill.yaml").write_text(MANIFEST.format(name="detector"))
     device = ["--device", f"fake:{arbiter.gpu_folder}", "--min-residency-s", "0"]
     detector = [
         "--name",

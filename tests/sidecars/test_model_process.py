@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.sidecars.conftest import PNG
+from tests.sidecars.conftest import MANIFEST, PNG
 from tests.sidecars.echo_sidecar import echo_for
 from tests.support.matrix_model import matrix_for
 from tests.support.waiting import until
@@ -32,18 +32,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 GB = 10**9
 MATRIX_BYTES = 64 * 2**20
 WAIT_S = 60.0
-MANIFEST = """
-name: test/eye
-version: 0.1.0
-kind: detector
-embodiment_tags: [any]
-chunk_size: 1
-weights_uri: hf://test/eye
-description: sees nothing
-latency_budget: {per_chunk_ms: 100}
-actions: [detect]
-detector: {labels: [cube]}
-"""
 
 
 class Place:
@@ -58,7 +46,7 @@ class Place:
     def processes(self, steady: int = GB, adapter: AdapterFor | None = None) -> ModelProcesses:
         footprint = Footprint(load_peak_bytes=steady, steady_bytes=steady, residue_bytes=GB // 10)
         settings = Settings(
-            "eye", parse_manifest(MANIFEST), Weights("test/eye"), footprint,
+            "eye", parse_manifest(MANIFEST.format(name="eye")), Weights("test/eye"), footprint,
             f"ipc://{self.folder}/eye.sock", f"fake:{self.gpu_folder}", None
         )  # fmt: skip
         echo = functools.partial(echo_for, self.folder)

@@ -2,9 +2,11 @@
 it that no other process can hit."""
 
 import asyncio
+from contextlib import asynccontextmanager
 
 import pytest
 
+from tests.sidecars.conftest import MANIFEST
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.errors import Evicted, ModelError, NotPermitted, NotResident
 from vram_arbiter.schemas.manifest import parse_manifest
@@ -18,18 +20,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
 
 GB = 10**9
 WAIT_S = 60.0
-MANIFEST = """
-name: test/eye
-version: 0.1.0
-kind: detector
-embodiment_tags: [any]
-chunk_size: 1
-weights_uri: hf://test/eye
-description: sees nothing
-latency_budget: {per_chunk_ms: 100}
-actions: [detect]
-detector: {labels: [cube]}
-"""
 
 
 class Model:
@@ -110,19 +100,32 @@ class Client(AsyncClient):
 
 def settings(daemon):
     footprint = Footprint(load_peak_bytes=GB, steady_bytes=GB, residue_bytes=GB // 10)
-    manifest = parse_manifest(MANIFEST)
+    manifest = parse_manifest(MANIFEST.format(name="eye"))
     return Settings(
         "eye", manifest, Weights("test/eye", local=False), footprint, "ipc://nobody",
         f"fake:{daemon.gpu_folder}", daemon.endpoint
     )  # fmt: skip
 
 
+@asynccontextmanager
+async def residing(daemon, models):
+    """A residency of these models, and its client; it leaves at the end."""
+    async with Client(daemon.endpoint) as client, asyncio.timeout(WAIT_S):
+        residency = Residency(settings(daemon), models, client)
+        yield residency, client
+        await residency.leave()
+
+
+async def until(condition):
+    while not condition():
+        await asyncio.sleep(0.01)
+
+
 async def test_an_unload_between_the_grant_and_the_load_is_heard(arbiter_daemon):
     """Regression: the wait was over and the lease not taken yet, so there was nothing to give up,
     and the model was loaded."""
     models = Models()
-    async with Client(arbiter_daemon.endpoint) as client, asyncio.timeout(WAIT_S):
-        residency = Residency(settings(arbiter_daemon), models, client)
+    async with residing(arbiter_daemon, models) as (residency, client):
         client.at_the_grant = residency.unload
         with pytest.raises(NotResident):
             await residency.load()
@@ -132,7 +135,6 @@ async def test_an_unload_between_the_grant_and_the_load_is_heard(arbiter_daemon)
             await asyncio.sleep(0.02)
         assert await residency.load(), "the next request asks anew"
         assert (models.loads, residency.state) == (1, "resident")
-        await residency.leave()
 
 
 async def test_an_unload_without_an_arbiter_is_heard_in_the_middle_of_a_load_too(arbiter_daemon):
@@ -143,8 +145,7 @@ async def test_an_unload_without_an_arbiter_is_heard_in_the_middle_of_a_load_too
     models.may_load.clear()
     async with asyncio.timeout(WAIT_S):
         loading = asyncio.create_task(residency.load())
-        while not models.loads:
-            await asyncio.sleep(0.01)
+        await until(lambda: models.loads)
         await residency.unload()
         with pytest.raises(NotResident):
             await loading
@@ -154,17 +155,14 @@ async def test_an_unload_without_an_arbiter_is_heard_in_the_middle_of_a_load_too
 
 async def test_each_residency_has_a_model_of_its_own(arbiter_daemon):
     models = Models()
-    async with AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client:
-        async with asyncio.timeout(WAIT_S):
-            residency = Residency(settings(arbiter_daemon), models, client)
-            await residency.load()
-            await residency.unload()
-            assert models.started[0].ended.is_set()
-            await residency.load()
-            assert len(models.started) == 2
-            assert not models.started[1].ended.is_set()
-            await residency.leave()
-            assert models.started[1].ended.is_set()
+    async with residing(arbiter_daemon, models) as (residency, _):
+        await residency.load()
+        await residency.unload()
+        assert models.started[0].ended.is_set()
+        await residency.load()
+        assert len(models.started) == 2
+        assert not models.started[1].ended.is_set()
+    assert models.started[1].ended.is_set()
 
 
 async def test_a_model_that_is_wanted_soon_is_read_ahead_and_nothing_else(
@@ -187,24 +185,21 @@ async def test_a_model_that_is_wanted_soon_is_read_ahead_and_nothing_else(
         assert (await reasoner.prepare("nobody")).told == 0
         for _ in range(2):
             assert (await reasoner.prepare("eye")).told == 1
-        while not models.in_host_ram:
-            await asyncio.sleep(0.01)
+        await until(lambda: models.in_host_ram)
         assert (models.reads, models.loads, (await client.status()).leases) == (1, 0, ())
         await residency.load()
         assert (models.reads, residency.state) == (1, "resident"), "it was there already"
         await residency.unload()
-        while models.in_host_ram:
-            await asyncio.sleep(0.01)
+        await until(lambda: not models.in_host_ram)
         await reasoner.prepare("eye")
-        while not models.in_host_ram:  # regression: the second hint in two minutes was ignored
-            await asyncio.sleep(0.01)
+        # regression: the second hint in two minutes was ignored
+        await until(lambda: models.in_host_ram)
         await residency.leave()
 
         monkeypatch.setattr("vram_arbiter.sidecars.host_copy.FORESEEN_S", 0.0)
         again = Residency(settings(arbiter_daemon), models, client)
         again.announce("reasoner")
-        while models.reads < 3 or models.in_host_ram:
-            await asyncio.sleep(0.01)
+        await until(lambda: models.reads == 3 and not models.in_host_ram)
         scarce = Models(weights_bytes=GB)
         crowded = Residency(settings(arbiter_daemon), scarce, client)
         crowded._host.size_bytes = (await client.status()).host_ram.budget_bytes + 1
@@ -219,32 +214,21 @@ async def test_weights_of_a_model_that_died_stay_for_the_next_request(arbiter_da
     """Regression: they were dropped, and the next request read all of them again. Where the budget
     of host RAM has no room for them they do go."""
     models = Models(weights_bytes=GB)
-    async with (
-        AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client,
-        asyncio.timeout(WAIT_S),
-    ):
-        residency = Residency(settings(arbiter_daemon), models, client)
+    async with residing(arbiter_daemon, models) as (residency, client):
         await residency.load()
         models.started[0].ended.set()
-        while residency.state != "unloaded":
-            await asyncio.sleep(0.01)
+        await until(lambda: residency.state == "unloaded")
         await residency.load()
         assert (models.reads, residency.state) == (1, "resident")
         residency._host._expected_bytes = (await client.status()).host_ram.budget_bytes + 1
         models.started[1].ended.set()
-        while models.in_host_ram:
-            await asyncio.sleep(0.01)
-        await residency.leave()
+        await until(lambda: not models.in_host_ram)
 
 
 async def test_weights_stay_in_host_ram_while_the_arbiter_has_room_for_them(arbiter_daemon):
     """A parked model comes back without reading its weights again, and an unload frees them."""
     models = Models(weights_bytes=GB)
-    async with (
-        AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client,
-        asyncio.timeout(WAIT_S),
-    ):
-        residency = Residency(settings(arbiter_daemon), models, client)
+    async with residing(arbiter_daemon, models) as (residency, client):
         assert await residency.load()
         await parked_for_another(residency, arbiter_daemon.endpoint)
         assert models.started[0].ended.is_set()
@@ -257,7 +241,6 @@ async def test_weights_stay_in_host_ram_while_the_arbiter_has_room_for_them(arbi
             await asyncio.sleep(0.02)
         assert await residency.load()
         assert models.reads == 2
-        await residency.leave()
 
 
 async def parked_for_another(residency, endpoint):
@@ -272,61 +255,48 @@ async def test_weights_leave_host_ram_where_the_arbiter_has_no_room_for_them(mak
     arbiter = make_arbiter(config="host: {park_budget_bytes: 1MB}")
     arbiter.start()
     models = Models(weights_bytes=GB)
-    async with AsyncClient("eye", endpoint=arbiter.endpoint) as client, asyncio.timeout(WAIT_S):
-        residency = Residency(settings(arbiter), models, client)
+    async with residing(arbiter, models) as (residency, _):
         assert await residency.load()
-        while models.in_host_ram:
-            await asyncio.sleep(0.01)
+        await until(lambda: not models.in_host_ram)
         other = AsyncClient("other", endpoint=arbiter.endpoint)
         async with other, other.lease(vram=8 * GB):
             assert residency.state == "unloaded"
         assert await residency.load()
         assert models.reads == 2
-        await residency.leave()
 
 
 async def test_an_idle_model_is_parked(arbiter_daemon):
     models = Models(weights_bytes=GB)
-    async with AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client:
-        async with asyncio.timeout(WAIT_S):
-            residency = Residency(settings(arbiter_daemon), models, client)
-            await residency.load()
-            idle = asyncio.create_task(residency.release_when_idle(0.0))
-            while residency.state != "parked":
-                await asyncio.sleep(0.01)
-            idle.cancel()
-            assert models.in_host_ram
-            assert await residency.load()
-            assert models.reads == 1
-            await residency.leave()
+    async with residing(arbiter_daemon, models) as (residency, _):
+        await residency.load()
+        idle = asyncio.create_task(residency.release_when_idle(0.0))
+        await until(lambda: residency.state == "parked")
+        idle.cancel()
+        assert models.in_host_ram
+        assert await residency.load()
+        assert models.reads == 1
 
 
 async def test_a_model_that_dies_ends_its_lease_and_the_next_request_loads_another(arbiter_daemon):
     models = Models()
-    async with AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client:
-        async with asyncio.timeout(WAIT_S):
-            residency = Residency(settings(arbiter_daemon), models, client)
-            with pytest.raises(ModelError, match="SIGKILL"):
-                await residency.run("detect", None, "die")
-            while residency.state != "unloaded" or (await client.status()).leases:
-                await asyncio.sleep(0.02)
-            assert residency.last_error.code == "model_error"
-            assert (await residency.run("detect", None, "look"))["answer"] == "look"
-            await residency.leave()
+    async with residing(arbiter_daemon, models) as (residency, client):
+        with pytest.raises(ModelError, match="SIGKILL"):
+            await residency.run("detect", None, "die")
+        while residency.state != "unloaded" or (await client.status()).leases:
+            await asyncio.sleep(0.02)
+        assert residency.last_error.code == "model_error"
+        assert (await residency.run("detect", None, "look"))["answer"] == "look"
 
 
 async def test_a_request_behind_an_unload_is_evicted_not_answered(arbiter_daemon):
     """Regression: an op that was queued before an unload ran after it."""
     models = Models()
-    async with AsyncClient("eye", endpoint=arbiter_daemon.endpoint) as client:
-        async with asyncio.timeout(WAIT_S):
-            residency = Residency(settings(arbiter_daemon), models, client)
-            await residency.load()
-            token = residency.token()
-            await residency.unload()
-            with pytest.raises(Evicted):
-                await residency.run("detect", token, "look")
-            await residency.leave()
+    async with residing(arbiter_daemon, models) as (residency, _):
+        await residency.load()
+        token = residency.token()
+        await residency.unload()
+        with pytest.raises(Evicted):
+            await residency.run("detect", token, "look")
 
 
 def test_every_state_can_be_reached_and_left():

@@ -28,7 +28,6 @@ pytestmark = pytest.mark.heavy
 
 CONTRACT = "{labels: [red, blue], input_size: [8, 4], score_threshold: 0.5}"
 BOXES = [[0.25, 0.5, 0.5, 1.0], [0.75, 0.5, 0.5, 1.0]]  # center and size of the halves
-PIXELS = 4 * 8
 
 
 def manifest_of(contract: str = CONTRACT, **fields: str) -> RSkillManifest:
