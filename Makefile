@@ -27,7 +27,7 @@ WORKERS ?= 4
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core setup-worlds jetson demo test test-core test-gpu nightly mutation measure lint format \
+.PHONY: help setup setup-core setup-worlds setup-vllm jetson demo test test-core test-gpu nightly mutation measure lint format \
 	chaos sim bench bench-doors bench-gateway bench-switch schemas docs clean
 
 help: ## this list
@@ -41,6 +41,9 @@ setup-core: ## environment of the base install (.venv-core)
 
 setup-worlds: ## LIBERO, with an older MuJoCo (.venv-worlds)
 	@bash .ci/setup worlds
+
+setup-vllm: ## vLLM for CPUs (.venv-vllm)
+	@bash .ci/setup vllm
 
 jetson: ## as root on a Jetson: system packages, Cyclone DDS, NVIDIA's torch: ARGS=--dry-run
 	@bash .ci/jetson $(ARGS)
@@ -57,7 +60,7 @@ test-gpu: setup ## what needs an NVIDIA GPU, alone on it; skipped with the reaso
 test-core: setup-core ## the base install alone, in seconds
 	$(CORE)/pytest -q -n $(WORKERS) $(BY_FILE) -m "not heavy and not e2e and not gpu" $(ARGS)
 
-nightly: setup setup-worlds ## random histories of the engine: HISTORIES=100000 MACHINE=leases SEED=n; long tests
+nightly: setup setup-worlds setup-vllm ## random histories of the engine: HISTORIES=100000 MACHINE=leases SEED=n; long tests
 	$(BIN)/pytest -q -m nightly
 	.venv-worlds/bin/pytest -q -m nightly tests/runner/sim/test_lerobot_worlds.py
 	$(TOOL) tests/nightly/nightly_run.py --histories $(HISTORIES) \
@@ -106,6 +109,6 @@ docs: setup ## the documentation site in build/site; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 clean: ## remove environments, caches and outputs
-	rm -rf .venv .venv-core .venv-worlds build dist out .coverage
+	rm -rf .venv .venv-core .venv-worlds .venv-vllm build dist out .coverage
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

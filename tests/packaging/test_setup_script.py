@@ -48,7 +48,7 @@ def set_up(folder: Path, *arguments: str, **environment: str) -> subprocess.Comp
 def test_usage(project: Path, arguments: list[str]) -> None:
     result = set_up(project, *arguments)
     assert result.returncode == 2
-    assert result.stderr == "usage: .ci/setup full|core|worlds\n"
+    assert result.stderr == "usage: .ci/setup full|core|worlds|vllm\n"
 
 
 def test_without_uv_and_python_it_says_what_to_install(project: Path) -> None:

@@ -38,7 +38,7 @@ def test_every_dependency_is_constrained() -> None:
         *page["project"]["optional-dependencies"].values(),
         *page["dependency-groups"].values(),
     ]
-    # exact versions are those of `.venv-worlds`, which the constraints were not made in
+    # exact versions are those of `.venv-worlds` and `.venv-vllm`: constraints.txt is `.venv`'s
     wanted = [name for names in sets for name in names if "==" not in name]
     names = {
         re.split(r"[\[<>=!~; ]", text, maxsplit=1)[0].lower().replace("_", "-") for text in wanted
