@@ -7,6 +7,7 @@ when it is opened.
 """
 
 import contextlib
+import gc
 import re
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
@@ -106,4 +107,5 @@ async def opened(
             await stack.enter_async_context(openpi.served(path, served))
         path.chmod(0o660)
         await stack.enter_async_context(on_port(door.port, path, CONNECTIONS_MAX, conduct))
+        gc.freeze()  # modules stay: no collection, which delays all robots, looks at them again
         yield
