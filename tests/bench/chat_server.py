@@ -22,7 +22,7 @@ STREAM: Final = (
 PIECE: Final = bytes(1 << 18)
 
 
-async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+async def answer_chats(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     try:
         while head := await reader.readuntil(b"\r\n\r\n"):
             method, path, _ = head.split(b" ", 2)
@@ -82,7 +82,9 @@ async def _pass_on(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> 
 
 
 async def main(port: int, to: int) -> None:
-    server = await asyncio.start_server(partial(relay, to) if to else serve, "127.0.0.1", port)
+    server = await asyncio.start_server(
+        partial(relay, to) if to else answer_chats, "127.0.0.1", port
+    )
     await server.serve_forever()
 
 

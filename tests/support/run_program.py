@@ -36,7 +36,7 @@ async def _start(
         try:
             openai_server.main(*command[len(COMMAND) :])
             code = 0
-        except BaseException:  # noqa: BLE001 - outermost: it must never run on as a second `vramctl`
+        except BaseException:  # noqa: BLE001  it must never run on as a second `vramctl`
             sys.excepthook(*sys.exc_info())
         finally:
             sys.stdout.flush()

@@ -543,7 +543,7 @@ def test_one_process_does_not_take_all_subscriptions() -> None:
 
 
 # -- requests at consumers
-def told(consumer: str, in_flight: int = 1, waiting: int = 0) -> dict[str, Any]:
+def at_consumer(consumer: str, in_flight: int = 1, waiting: int = 0) -> dict[str, Any]:
     return {"consumer": consumer, "in_flight": in_flight, "waiting": waiting}
 
 
@@ -554,13 +554,18 @@ def test_a_status_counts_requests_as_long_as_their_client_is_there(session_bench
     acquire(session_bench)
     session_bench.concerned.add(session_bench.client(b"a"))
     session_bench.events.clear()
-    assert session_bench.ask("demand", b"a", consumers=[told("x"), told("y")])["ok"]
-    assert session_bench.ask("demand", b"a", consumers=[told("llm", 3, 12)])["ok"]
+    assert session_bench.ask("demand", b"a", consumers=[at_consumer("x"), at_consumer("y")])["ok"]
+    assert session_bench.ask("demand", b"a", consumers=[at_consumer("llm", 3, 12)])["ok"]
     shown = session_bench.ask("status", b"v")["demands"]
-    assert shown == [told("llm", 3, 12) | {"client": "gateway"}], "the last replaces all"
+    assert shown == [at_consumer("llm", 3, 12) | {"client": "gateway"}], "the last replaces all"
     assert "demands" not in session_bench.ask("status", b"v", after=[1, 2.5, 3])
     assert code(session_bench.ask("demand", b"v", consumers=[])) == "not_permitted"
-    for wrong in (told("llm", -1), told("llm", 1 << 31), told("a\nb"), {"consumer": "llm"}):
+    for wrong in (
+        at_consumer("llm", -1),
+        at_consumer("llm", 1 << 31),
+        at_consumer("a\nb"),
+        {"consumer": "llm"},
+    ):
         assert code(session_bench.ask("demand", b"a", consumers=[wrong])) == "bad_request"
     assert session_bench.events == []
     session_bench.hang_up(b"a")
@@ -573,7 +578,7 @@ def test_one_process_does_not_tell_of_all_consumers_of_a_status() -> None:
     session_bench = make_bench(process_share=share, sessions_max=1000)
     for via in (b"a", b"b"):
         session_bench.hello(via)
-    three, two = ([told(f"m{number}") for number in range(count)] for count in (3, 2))
+    three, two = ([at_consumer(f"m{number}") for number in range(count)] for count in (3, 2))
     assert session_bench.ask("demand", b"a", consumers=three)["ok"]
     assert session_bench.ask("demand", b"a", consumers=three)["ok"], "in place of the same"
     refused = session_bench.ask("demand", b"b", consumers=two)

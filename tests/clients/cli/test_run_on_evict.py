@@ -37,7 +37,7 @@ HOST = f"127.{1 + _PID // 65536 % 250}.{_PID // 256 % 256}.{1 + _PID % 250}"
 PORTS = itertools.count(20000)
 
 
-def job(arbiter: ArbiterProcess, *arguments: str) -> AbstractContextManager[Running]:
+def stand_in_job(arbiter: ArbiterProcess, *arguments: str) -> AbstractContextManager[Running]:
     """`vramctl run` of a program."""
     words = ("run", "--vram", "5GiB", "--name", "job", *arguments)
     return running("vramctl", words, arbiter.environ)
@@ -51,7 +51,7 @@ def server(
     port = str(next(PORTS))
     command = [*SERVER, str(arbiter.gpu_folder), str(4 << 30), HOST, port, *broken]
     urls = [option.replace("URL", f"http://{HOST}:{port}") for option in options]
-    with job(arbiter, "--on-evict", action, *urls, "--", *command) as run:
+    with stand_in_job(arbiter, "--on-evict", action, *urls, "--", *command) as run:
         yield run, int(run.line())
 
 
@@ -67,7 +67,7 @@ def test_a_stopped_program_is_started_again(
 ) -> None:
     """Its child does not end with it, and is ended too: it could hold the memory."""
     program = [sys.executable, "-c", PROGRAM]
-    with job(arbiter_daemon, "--on-evict", "stop", "--", *program) as run:
+    with stand_in_job(arbiter_daemon, "--on-evict", "stop", "--", *program) as run:
         first, orphan = map(int, run.line().split())
         lease = client.acquire(spec("b", 5), PATIENCE_S)
         run.said("ending it")
@@ -96,7 +96,7 @@ def test_a_stopped_program_that_ends_by_itself_ends_vramctl(arbiter_daemon: Arbi
 
 def test_a_program_does_not_outlive_a_killed_vramctl(arbiter_daemon: ArbiterProcess) -> None:
     """Regression: it went on without a lease, and a suspended one would have stayed for ever."""
-    with job(arbiter_daemon, "--", "sh", "-c", "echo $$; exec sleep 1000") as run:
+    with stand_in_job(arbiter_daemon, "--", "sh", "-c", "echo $$; exec sleep 1000") as run:
         program = int(run.line())
         run.process.kill()
         until(lambda: not alive(program))

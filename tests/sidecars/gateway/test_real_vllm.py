@@ -128,8 +128,8 @@ class Bench:
             os.kill(engine, signal.SIGCONT)
 
 
-@pytest.fixture
-def bench(
+@pytest.fixture(name="bench")
+def gateway_bench(
     gateway: Callable[..., GatewayProcess], arbiter_daemon: ArbiterProcess, model: Path
 ) -> Callable[..., Bench]:
     """`bench(on_evict=…)` starts one."""
