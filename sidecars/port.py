@@ -114,18 +114,17 @@ async def on_port(
     looking = asyncio.Lock()  # one at a time: refused users must not cost the event loop its time
 
     async def connected(client: socket.socket) -> None:
-        reader, writer = await asyncio.open_connection(sock=client)
         try:
-            if conduct is not None:
-                await asyncio.sleep(conduct.debt_s())
-            async with looking:
-                lets_in = await asyncio.to_thread(_may_connect, writer, path)
-            if lets_in:
-                await _pass_on(reader, writer, path, conduct)
+            reader, writer = await asyncio.open_connection(sock=client)
+            with contextlib.closing(writer):
+                if conduct is not None:
+                    await asyncio.sleep(conduct.debt_s())
+                async with looking:
+                    lets_in = await asyncio.to_thread(_may_connect, writer, path)
+                if lets_in:
+                    await _pass_on(reader, writer, path, conduct)
         except OSError as error:
             _log.warning("a connection to port %d ended: %s", port, error)
-        finally:
-            writer.close()
 
     async def accept() -> None:
         while True:

@@ -22,10 +22,11 @@ import numpy as np
 
 from tests.bench.harness import Suite, elapsed_us, p50, pause
 from tests.sidecars.doors.conftest import GRAB, KEY, Served, two_doors
+from tests.sidecars.doors.test_lerobot_door import Peer
+from vram_arbiter.schemas.defaults import MIB
 
 PERIOD_S = 0.1
 P99_MAX_US = 50_000.0
-MIB = 1 << 20
 CHUNK, JOINTS = 12, 6
 HOST = "127.0.0.1"
 
@@ -59,13 +60,9 @@ class Lerobot:
     """lerobot's messages, on a connection of its own."""
 
     def __init__(self, port: int) -> None:
-        import grpc
         from lerobot.async_inference.helpers import RemotePolicyConfig
-        from lerobot.transport import services_pb2, services_pb2_grpc
 
-        options = [("grpc.use_local_subchannel_pool", 1), ("grpc.enable_retries", 0)]
-        self.channel = grpc.insecure_channel(f"{HOST}:{port}", options)
-        self.stub, self.messages = services_pb2_grpc.AsyncInferenceStub(self.channel), services_pb2
+        self.peer = Peer(f"{HOST}:{port}")
         names = [f"joint_{number}" for number in range(JOINTS)]
         picture = {"dtype": "image", "shape": (96, 96, 3), "names": ["height", "width", "channels"]}
         features = {
@@ -78,27 +75,22 @@ class Lerobot:
             "task": "grab the red cube",
         }
         config: Any = RemotePolicyConfig("act", GRAB, features, CHUNK)
-        self.instruct(pickle.dumps(config))
+        assert self.peer.instruct(config) == "OK"
         self.step = 0
 
-    def instruct(self, data: bytes) -> None:
-        self.stub.SendPolicyInstructions(self.messages.PolicySetup(data=data))
-
-    def sends(self, *pieces: bytes) -> None:
-        chunks = [(2, piece) for piece in pieces] + [(3, b"")]
-        kind = self.messages.Observation
-        self.stub.SendObservations(kind(transfer_state=state, data=data) for state, data in chunks)
+    def sends(self, *pieces: bytes) -> str:
+        return self.peer.observe(iter([*((2, piece) for piece in pieces), (3, b"")]))
 
     def act(self) -> None:
         from lerobot.async_inference.helpers import TimedObservation
 
         self.step += 1
         observation = TimedObservation(time.time(), self.step, self.seen, must_go=True)
-        self.sends(pickle.dumps(observation))
-        assert self.stub.GetActions(self.messages.Empty()).data
+        assert self.sends(pickle.dumps(observation)) == "OK"
+        assert self.peer.stub.GetActions(self.peer.messages.Empty()).data
 
     def close(self) -> None:
-        self.channel.close()
+        self.peer.channel.close()
 
 
 class Hostile:
@@ -137,7 +129,7 @@ def sent(kind: type[Openpi] | type[Lerobot], *data: bytes) -> Callable[[int], No
 def instructs(port: int) -> None:
     peer = Lerobot(port)
     try:
-        peer.instruct(pickle.dumps(Hostile()))
+        peer.peer.instruct(Hostile())
     finally:
         peer.close()
 

@@ -54,9 +54,7 @@ def episode_programs() -> Iterator[Programs]:
 # -- how a goal ends
 async def done(stage: Stage) -> None:
     goal = await stage.goal_under_way()
-    for _ in range(
-        20
-    ):  # an operator asks again where nobody answered in the seconds that he is made to wait
+    for _ in range(20):  # an operator asks again where no answer came in time
         environ = stage.programs.arbiter.environ
         shown = await asyncio.to_thread(run, "vramctl", ["status"], environ, WAIT_S)
         if shown.returncode != UNREACHABLE:
@@ -258,8 +256,8 @@ def test_a_policy_is_called_back_from_standby_only_as_long_as_its_goal_wants_it(
 
 # -- while it runs
 async def wanted_meanwhile(stage: Stage) -> None:
-    """Nobody is made to leave in the middle of a step; the look that was wanted comes with the
-    goal's end."""
+    """No holder leaves in the middle of a step; the look that was wanted comes with the goal's
+    end."""
     goal = await stage.goal_under_way()
     with pytest.raises(WaitTimeout):
         await stage.detector.load(timeout_s=0.2)
@@ -300,7 +298,7 @@ async def one_after_the_other(stage: Stage) -> None:
 
 
 async def without_a_gpu(stage: Stage) -> None:
-    """A goal without a GPU sends nobody away."""
+    """A goal without a GPU evicts no holder."""
     before = await stage.detector.ping(timeout_s=WAIT_S)
     goal = await stage.runner.send_goal(
         "vram-arbiter/so101-navigate", goal_params={"turn_rad": 0.1}

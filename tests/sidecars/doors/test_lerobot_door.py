@@ -203,7 +203,7 @@ class Peer:
         try:
             call()
         except grpc.RpcError as error:
-            return f"{error.code().name}: {error.details()}"  # type: ignore[attr-defined]
+            return f"{error.code().name}: {error.details()}"
         return "OK"
 
 
