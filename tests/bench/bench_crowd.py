@@ -1,6 +1,7 @@
 """Many at once: ten thousand live leases, ten thousand waiters' memory, ten thousand connections
 that vanish in one moment, a flood."""
 
+import resource
 import signal
 import time
 from collections.abc import Callable
@@ -91,8 +92,13 @@ def fill_history(peer: Peer) -> None:
 
 
 def disconnects(suite: Suite) -> None:
-    """Processes with thousands of connections, each of which waits, are killed in one moment."""
-    many = suite.size(10_000, 1000)
+    """Processes with thousands of connections, each of which waits, are killed in one moment.
+
+    The daemon takes as many connections as its open files allow (`settings.router_limits`).
+    """
+    open_files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    most = 10_000 if open_files == resource.RLIM_INFINITY else open_files // 4
+    many = min(suite.size(10_000, 1000), most) // CROWD_PROCESSES * CROWD_PROCESSES
     with arbiter() as daemon:
         witness = Peer(daemon.endpoint, "witness").hello()
         lease = witness.acquire()
