@@ -134,11 +134,10 @@ class OpenPage:
                 key, _, value = line.decode().rstrip("\n").partition(": ")
                 if key == "event":
                     name = value
-                elif key == "data" and name in ("snapshot", "change"):
-                    data = json.loads(value)
-                    status = data if name == "snapshot" else data["status"]
+                elif key == "data" and name in ("snapshot", "page"):
+                    leases = json.loads(value)["leases"]
                     with self._changed:
-                        self._ids |= {name, *(one["lease_id"] for one in status["leases"])}
+                        self._ids |= {name, *(one["lease_id"] for one in leases)}
                         self._changed.notify()
         except (OSError, ValueError, AttributeError):
             return  # closed
