@@ -20,6 +20,7 @@ from typing import Final
 
 from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.ports import listen
 from vram_arbiter.schemas.runtime.trust import ROOT, port_uids
 
 CONNECTIONS_MAX = 64
@@ -142,7 +143,7 @@ async def on_port(
             await asyncio.sleep(ACCEPT_PAUSE_S)
 
     try:
-        listening = socket.create_server(("127.0.0.1", port), backlog=connections_max)
+        listening = listen("127.0.0.1", port, connections_max)
     except OSError as error:
         raise ConfigError(
             f"port {port} of 127.0.0.1 cannot be served: {os.strerror(error.errno or 0)}",

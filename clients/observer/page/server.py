@@ -18,6 +18,7 @@ from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.ports import listen
 from vram_arbiter.schemas.runtime.trust import port_uids
 from vram_arbiter.schemas.urls import HttpAddress
 
@@ -100,9 +101,8 @@ class Connections:
 
 def bound(address: HttpAddress) -> socket.socket:
     """Return a listening socket. Raises ConfigError."""
-    family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
     try:
-        return socket.create_server((address.host, address.port), family=family, backlog=BACKLOG)
+        return listen(address.host, address.port, BACKLOG)
     except OSError as error:
         raise ConfigError(
             f"http.listen: cannot listen on {address}: {error.strerror}",

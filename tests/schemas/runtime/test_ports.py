@@ -1,5 +1,6 @@
-"""Ports for programs that listen later."""
+"""Ports for programs that listen later, and sockets that listen."""
 
+import asyncio
 import socket
 from pathlib import Path
 
@@ -23,3 +24,27 @@ def test_one_that_is_taken_is_left_out(tmp_path: Path, monkeypatch: pytest.Monke
         with pytest.raises(OSError, match="is free"):
             ports.free_port()
     assert ports.free_port() == port
+
+
+def test_what_a_connection_sends_is_not_kept_back() -> None:
+    """A robot's answer waited for its client's delayed acknowledgment, 40 ms: asyncio leaves
+    Nagle's algorithm on for a listening socket that it is given."""
+
+    async def story() -> int:
+        nodelay: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+
+        def connected(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            own: socket.socket = writer.get_extra_info("socket")
+            nodelay.set_result(own.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+            writer.close()
+
+        async with await asyncio.start_server(
+            connected, sock=ports.listen("127.0.0.1", 0, 1)
+        ) as server:
+            address = server.sockets[0].getsockname()
+            _, writer = await asyncio.open_connection(*address[:2])
+            found = await nodelay
+            writer.close()
+        return found
+
+    assert asyncio.run(asyncio.wait_for(story(), 60)) == 1
