@@ -9,7 +9,8 @@ and those that mean the same stand in `equivalent.json` beside this file, each w
 pytest collects once. Each mutant is tried in a fork of that process: the mutant's bytecode takes
 the place of the function's, so whoever imported the function has the mutant, and only the tests
 themselves cost time. The rule machines are left out: they are slow, and what only they kill
-deserves a test with a name.
+deserves a test with a name. With `--explore 60`, what no test kills is tried by so many seconds of
+`tests.explore`; the report names the world that kills it.
 """
 
 import argparse
@@ -36,6 +37,9 @@ from types import CodeType, FunctionType
 from typing import Any, NoReturn
 
 import pytest
+
+from tests.explore.scenarios import SCENARIOS
+from tests.explore.search import Search
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = ROOT / "arbiter/core"
@@ -247,8 +251,11 @@ class Trials:
     """A pytest plugin that runs, for each mutant and in a fork, the tests that come by its lines,
     until one fails."""
 
-    def __init__(self, mutants: list[Mutant], jobs: int, folder: Path) -> None:
+    def __init__(
+        self, mutants: list[Mutant], jobs: int, folder: Path, explore_s: float = 0.0
+    ) -> None:
         self.mutants = mutants
+        self.explore_s = explore_s
         self.jobs = jobs
         self.folder = folder
         self.failed = ""
@@ -326,6 +333,8 @@ class Trials:
                 if self.failed:
                     break
             else:
+                self.failed = "" if mutant is None else explored(self.explore_s)
+            if not self.failed:
                 status = SURVIVED
                 then()
         finally:
@@ -351,7 +360,16 @@ class Trials:
             )
 
 
-def run(mutants: list[Mutant], jobs: int) -> None:
+def explored(seconds: float) -> str:
+    """Explore each scenario for its share of the time. Return the first failure; "" for none."""
+    for name, scenario in SCENARIOS.items() if seconds else ():
+        report = Search(scenario).run(seconds / len(SCENARIOS))
+        if report.failure is not None:
+            return f"explore {name}: {report.failure.error}"
+    return ""
+
+
+def run(mutants: list[Mutant], jobs: int, explore_s: float) -> None:
     """Try all mutants, `jobs` at a time; each knows its outcome afterwards."""
     options = [
         TESTS,
@@ -365,7 +383,7 @@ def run(mutants: list[Mutant], jobs: int) -> None:
     limits = ["-o", f"timeout={TEST_TIMEOUT_S}", "-o", "faulthandler_timeout=0"]
     os.chdir(ROOT)
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()) as said:
-        trials = Trials(mutants, jobs, Path(folder))
+        trials = Trials(mutants, jobs, Path(folder), explore_s)
         pytest.main([*options, *limits], plugins=[trials])
     if any(not mutant.outcome for mutant in mutants):
         raise SystemExit(trials.problem or f"{said.getvalue()}\nnot every mutant was tried")
@@ -402,6 +420,9 @@ def main() -> int:
         "--sample", type=int, default=300, help="this many by chance; 0: all (hours)"
     )
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--explore", type=float, default=0.0, help="seconds of exploration for each survivor"
+    )
     parser.add_argument("--again", type=Path, help="the survivors of this report")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--out", type=Path, default=ROOT / "out/mutation/report.json")
@@ -414,7 +435,7 @@ def main() -> int:
     existing, mutants = choose(options.sample, options.seed, only)
     print(f"{existing} mutants, {len(mutants)} of them are tried", flush=True)
     known = json.loads(KNOWN.read_text())
-    run(mutants, options.jobs)
+    run(mutants, options.jobs, options.explore)
     report = summary_of(existing, sorted(mutants, key=lambda mutant: mutant.name), known)
     report |= {"seed": options.seed, "wall_s": round(time.perf_counter() - began, 1)}
     options.out.parent.mkdir(parents=True, exist_ok=True)
