@@ -19,8 +19,8 @@ from tests.explore.fingerprint import fingerprint
 from tests.explore.world import Action, Scenario, World
 
 SERVE: Final = (
-    *("send", "hear", "connect", "die", "answer", "return", "room", "read"),
-    *("load", "ready", "end", "repay", "clear", "free", "leave", "tick", "sleep"),
+    *("send", "hear", "connect", "die", "return", "read"),
+    *("load", "ready", "end", "free", "leave", "tick", "sleep"),
 )
 """What happens where nothing fails and no client wants anything new, the first that can."""
 BENIGN = frozenset(SERVE)

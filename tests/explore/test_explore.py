@@ -1,19 +1,18 @@
 """The explorer itself: a tiny world to its end, a seeded defect by its shortest story, and which
 worlds count as the same."""
 
-from dataclasses import replace
 
 import pytest
 
-from tests.explore.clients import Broken
+from tests.explore.client import Broken
 from tests.explore.cloning import freeze, thaw
 from tests.explore.fingerprint import canonical, fingerprint
 from tests.explore.scenarios import BIG, TALKS, kind
-from tests.explore.search import Search, play, waits
+from tests.explore.search import Search, play
 from tests.explore.world import CAPACITY_BYTES, OVERHEAD_BYTES, STEP_S, Action, Scenario
 from vram_arbiter.arbiter.core.arbiter import Arbiter
-from vram_arbiter.arbiter.core.effects import Effect, Push
-from vram_arbiter.arbiter.core.events import Asked, Event, MemorySampled
+from vram_arbiter.arbiter.core.effects import Effect
+from vram_arbiter.arbiter.core.events import Asked, Event, MemorySampled, ProbeFailed
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.wire.requests import Release
 
@@ -50,7 +49,7 @@ def test_a_tiny_world_is_explored_to_its_end() -> None:
     assert report.complete
     assert report.unproven == 0
     assert report.transitions == report.merged + report.states - 1
-    assert {"acquire", "load", "ready", "use", "end", "leave", "clear", "read"} <= set(report.verbs)
+    assert {"acquire", "load", "ready", "use", "end", "leave", "free", "read"} <= set(report.verbs)
 
 
 def test_a_defect_is_found_with_its_shortest_story() -> None:
@@ -58,7 +57,7 @@ def test_a_defect_is_found_with_its_shortest_story() -> None:
     scenario = Scenario("credulous", (BIG, BIG), lags=True, engine=Credulous)
     report = Search(scenario).run(60.0)
     assert report.failure is not None
-    expected = "acquire a, load a, ready a, leave a, clear a, acquire b"
+    expected = "acquire a, load a, ready a, leave a, free a, acquire b"
     assert report.failure.story == story(expected)
     assert "are granted or occupied" in report.failure.error
     assert "play(SCENARIOS['credulous'], [('acquire', 'a')" in report.failure.told("credulous")
@@ -66,21 +65,20 @@ def test_a_defect_is_found_with_its_shortest_story() -> None:
         play(scenario, report.failure.story)
 
 
-class Mute(Arbiter):
-    """A seeded defect: grants that are pushed get lost."""
+class Blind(Arbiter):
+    """A seeded defect: no reading counts, so that nothing is granted."""
 
     def handle(self, event: Event, now: float) -> list[Effect]:
-        effects = super().handle(event, now)
-        return [one for one in effects if not isinstance(one, Push) or one.body.TAG[1] != "granted"]
+        if isinstance(event, MemorySampled):
+            event = ProbeFailed(event.gpu, event.taken_at, "unread")
+        return super().handle(event, now)
 
 
 def test_a_waiter_that_no_path_serves_is_found() -> None:
-    scenario = Scenario("mute", (replace(BIG, evictable=False), BIG), engine=Mute)
-    search = Search(scenario)
-    report = search.run(60.0, states_max=60)
+    report = Search(Scenario("blind", (BIG,), engine=Blind)).run(60.0)
     assert report.failure is not None
-    assert report.failure.error == "a client waits for ever"
-    assert waits(play(scenario, report.failure.story))
+    assert report.failure.story == story("acquire a")
+    assert report.failure.error == "no path serves those that wait"
 
 
 # -- copies

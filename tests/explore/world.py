@@ -1,43 +1,35 @@
 """One small world: the engine, its journal, GPUs, clients, and what is under way between them.
 
-An action is what may happen next (`World.actions`); `World.act` lets it happen and checks all that
-must hold then. Nothing happens by itself, so the order of the actions is the whole story. Every
-event has a moment of its own, `STEP_S` after the one before; time passes otherwise only by the
-actions `tick` and `sleep`. It knows neither how worlds are searched nor which of them are alike.
+An action is what may happen next (`World.actions`); `World.act` lets it happen and checks what must
+hold then. Nothing else happens, so the order of the actions is the whole story. Every event has a
+moment of its own, `STEP_S` after the one before; time passes otherwise only by `tick`, `late` and
+`sleep`. It knows neither how worlds are searched nor which of them are alike.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
-from tests.explore.clients import Broken, Hand, Talker, Told
+from tests.explore.client import Broken, Client, Told
 from tests.support.engine_state import state_of
 from tests.support.full_check import check_arbiter
 from vram_arbiter.arbiter.core import effects as fx
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.model.lease import LeaseState
-from vram_arbiter.arbiter.core.model.records import AnyRecord
-from vram_arbiter.arbiter.core.model.refusals import NotJournaled
+from vram_arbiter.arbiter.core.model.records import AnyRecord, LeaseRecord
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.arbiter.host.records import processes_of
 from vram_arbiter.schemas import defaults as d
-from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token
-from vram_arbiter.schemas.wire import requests as w
-from vram_arbiter.schemas.wire.errors import Refusal
-from vram_arbiter.schemas.wire.replies import AnyReply
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
-CAPACITY_BYTES = 8 * d.GIB
-OVERHEAD_BYTES = 100 * d.MIB
-"""The driver's own."""
-STRANGER, STRANGER_BYTES = ProcessKey(9, 9), 150 * d.MIB
-"""A process without a lease. With the driver's own bytes it fits the reserve."""
-START_S = 1024.0
-STEP_S = 2.0**-20
+CAPACITY_BYTES, OVERHEAD_BYTES = 8 * d.GIB, 100 * d.MIB
+"""Of each GPU; the driver's own."""
+START_S, STEP_S = 1024.0, 2.0**-20
 FOR_EVER_S, FAR_S = 3600.0, 600.0
 """The longest time to live; what is due so much later is not waited for."""
 SLEEP_EVENTS_MAX = 400
@@ -50,33 +42,29 @@ QUICK: Mapping[str, Any] = {
     "verify_poll_until_s": (0.5, 1.0),
     "probe_load_s": 0.5,
     "fence_grace_s": 2.0,
-    "host_ram_budget_bytes": 4 * d.GIB,
 }
 """Constants of the engine in these worlds: few polls, so that more happens between two of them."""
-FAULTS = frozenset(
-    {
-        *("cancel", "crash", "bye", "drop", "evict", "kill", "late", "fail", "full", "restart"),
-        *("lie less", "lie more", "lie nonsense", "stranger", "suspend"),
-    }
-)
+LIES: Mapping[str, int] = {"nothing": 0, "everything": CAPACITY_BYTES, "nonsense": 1 << 60}
+"""Bytes that a lying reading shows as used."""
+FAULTS = frozenset({"cancel", "crash", "drop", "fail", "late", "lie", "restart"})
 """Verbs that happen only where a scenario allows it, and so often."""
 _PERIODIC = ("probe", "verify", "revoke")
 
 type Action = tuple[str, str]
-"""(verb, whose): a client's or process's name, a GPU, or ""."""
+"""(verb, whose): the name of a client, a process or a GPU; ""."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """What a world is made of. Clients with the same spec are alike.
+    """What a world is made of.
 
     Args:
-        clients: The spec of each client's lease; its consumer is the client's kind.
+        clients: The spec of each client's lease.
         acquires: How often each client asks.
-        faults: Verbs that may happen only so often in one story (`World.actions`).
-        borrows: Whether clients use the leases of others.
+        faults: How often these verbs may happen in one story.
         lags: Whether the driver returns memory late.
-        talks: Whether clients speak the client's protocol, with messages under way.
+        talks: Whether messages are under way until they are sent and heard; else they arrive at
+            once.
     """
 
     name: str
@@ -85,66 +73,10 @@ class Scenario:
     acquires: int = 1
     wait_timeout_s: float | None = None
     faults: Mapping[str, int] = field(default_factory=dict)
-    borrows: bool = False
     lags: bool = False
     lists: bool = True
     talks: bool = False
     engine: type[Arbiter] = Arbiter
-
-
-class Client(Protocol):
-    """One process that leases (`tests.explore.clients`)."""
-
-    name: str
-    spec: LeaseSpec
-    process: ProcessKey
-    client: ClientId
-    connections: int
-    lease: LeaseId  # "": none
-
-    def connect(self, world: "World") -> None:
-        """Say hello on a new connection, and what it had."""
-        ...
-
-    def actions(self, world: "World") -> Iterator[str]:
-        """Yield the verbs of what it may do."""
-        ...
-
-    def act(self, verb: str, world: "World") -> None: ...
-
-    def hear(self, told: Told, re: RequestId | None, epoch: int) -> None:
-        """Take what the engine says to its connection."""
-        ...
-
-    def cut_off(self, world: "World") -> None:
-        """The daemon is another one: no connection outlives it."""
-        ...
-
-    def has_mail(self) -> bool:
-        """Whether a message from it or to it is under way."""
-        ...
-
-    def next_deadline(self) -> float | None: ...
-
-    def tick(self, world: "World") -> None: ...
-
-    def coming_bytes(self, gpu: GpuId, held_bytes: int) -> int:
-        """Return what it may put on a GPU at any moment, beyond what it holds there."""
-        ...
-
-    def is_waiting(self) -> bool: ...
-
-    def standing(self) -> tuple[Any, ...]:
-        """Return what it is in, to order clients that are alike."""
-        ...
-
-    def is_excused(self) -> bool:
-        """Whether it may hold bytes that are not charged: it has lost its lease."""
-        ...
-
-    def check(self, core: Core, others: Iterable["Client"]) -> None:
-        """Raise Broken where the engine does not know what this client counts on."""
-        ...
 
 
 @dataclass(slots=True)
@@ -157,7 +89,6 @@ class Device:
     late: dict[ProcessKey, int] = field(default_factory=dict)  # given up, and shown all the same
     reading: ev.MemorySampled | None = None
     again: bool = False  # a question came after the reading began
-    stuck: bool = False  # the reading hangs, and was told as failed
 
     def set(self, process: ProcessKey, count: int, *, lags: bool) -> None:
         """A process holds so many bytes from now on."""
@@ -167,123 +98,107 @@ class Device:
         if count:
             self.held[process] = count
 
-    def shown(self) -> dict[ProcessKey, int]:
-        """Bytes as a reading sees them."""
-        return {
-            process: self.held.get(process, 0) + self.late.get(process, 0)
-            for process in sorted(self.held.keys() | self.late.keys())
-        }
+    def used_bytes(self) -> int:
+        """Return what a reading shows."""
+        return OVERHEAD_BYTES + sum(self.held.values()) + sum(self.late.values())
 
-    def begin(self, now: float) -> None:
-        """Begin a reading, right after the event that asks for it."""
-        shown = self.shown()
-        listed = tuple(ev.ProcessUse(process, "", count) for process, count in shown.items())
-        self.again = False
-        self.reading = ev.MemorySampled(
-            self.gpu,
-            now + STEP_S / 2,
-            OVERHEAD_BYTES + sum(shown.values()),
-            CAPACITY_BYTES,
-            listed if self.lists else None,
-        )
+    def ask(self, now: float) -> None:
+        """Begin a reading right after the event that asks for it, or after the one under way."""
+        self.again = self.reading is not None
+        if not self.again:
+            at = now + STEP_S / 2
+            listed = tuple(
+                ev.ProcessUse(process, "", self.held.get(process, 0) + self.late.get(process, 0))
+                for process in sorted(self.held.keys() | self.late.keys())
+            )
+            told = (self.used_bytes(), CAPACITY_BYTES, listed if self.lists else None)
+            self.reading = ev.MemorySampled(self.gpu, at, *told)
 
 
 @lru_cache(maxsize=64)
 def _settings(gpus: int, epoch: int) -> Settings:
-    infos = (
+    infos = [
         GpuInfo(GpuId(f"GPU-{n}"), n, "", CAPACITY_BYTES, total_bytes=CAPACITY_BYTES)
         for n in range(gpus)
-    )
+    ]
     return Settings(epoch=epoch, gpus=tuple(infos), **QUICK)
 
 
 class World:
-    """See the module. `left`: how often each limited verb may still happen."""
+    """See the module. `left`: how often each fault may still happen."""
+
+    engine: Arbiter
 
     def __init__(self, scenario: Scenario) -> None:
-        self.scenario = scenario
-        self.now = START_S
-        self.epoch = 0
-        self.engine: Arbiter
-        self.devices = {
-            info.id: Device(info.id, scenario.lists) for info in _settings(scenario.gpus, 1).gpus
+        self.scenario, self.left = scenario, dict(scenario.faults)
+        self.now, self.epoch = START_S, 0
+        gpus = [info.id for info in _settings(scenario.gpus, 1).gpus]
+        self.devices = {gpu: Device(gpu, scenario.lists) for gpu in gpus}
+        self.clients = {
+            name: Client(name, spec, scenario.acquires)
+            for name, spec in zip("abcdef", scenario.clients, strict=False)
         }
-        make = Talker if scenario.talks else Hand
-        specs = zip("abcdef", scenario.clients, strict=False)
-        self.clients: dict[str, Client] = {name: make(name, spec, scenario) for name, spec in specs}
         self.journal: dict[str, AnyRecord] = {}
-        self.owed: set[str] = set()  # records to be deleted once the disk has room
-        self.disk_full = False
-        self.left = dict(scenario.faults)
-        self.last_token = Token(0, 0)
+        self.last_token = (0, 0)
         self.dead: set[ProcessKey] = set()
         self.unheard: list[ProcessKey] = []  # deaths that the daemon will hear of
         self.lied = False
-        self._requests = 0
-        self._reply: AnyReply | Refusal | None = None
-        self._start()
+        self.do_restart()
         for client in self.clients.values():
-            client.connect(self)
-        for device in self._reading():
-            self._answered(device, None)
+            client.act("connect", self)
+            self._deliver()
+        for gpu in gpus:
+            self.do_read(gpu)
 
     # -- what may happen
     def actions(self) -> list[Action]:
         """Return everything that may happen next."""
-        left = self.left
-        found = [
-            (verb, name)
-            for name, client in self.clients.items()
-            for verb in client.actions(self)
-            if left.get(verb, verb not in FAULTS)
-        ]
+        found = [(verb, one.name) for one in self.clients.values() for verb in one.actions()]
         for gpu, device in self.devices.items():
             if device.reading is not None:
-                lies = ("lie less", "lie more", "lie nonsense")
-                found += [(verb, gpu) for verb in ("fail", *lies) if left.get(verb)]
-                found.append(("read", gpu))
-            found += [("answer", gpu)] if device.stuck else []
+                found += [("read", gpu), ("fail", gpu)]
+                found += [("lie", f"{gpu} {lie}") for lie in LIES]
             found += [("return", gpu)] if device.late else []
-        found += [("die", str(process)) for process in self.unheard]
-        found += [(verb, "") for verb in ("restart", "suspend", "stranger") if left.get(verb)]
-        if self.disk_full:
-            found.append(("room", ""))
-        elif left.get("full"):
-            found.append(("full", ""))
-        return found + [(verb, "") for verb in self._passing()]
-
-    def _passing(self) -> list[str]:
-        """Return how time may pass: not while anything is under way, unless that may be late."""
-        busy = any(device.reading for device in self.devices.values()) or any(
-            client.has_mail() for client in self.clients.values()
-        )
-        if busy:
-            return ["late"] if self.left.get("late") and self._next_at() else []
+        found += [("die", str(process)) for process in self.unheard] + [("restart", "")]
         tick, sleep = self._next_at(), self._decisive_at()
-        found = [] if tick is None else ["tick"]
-        return found if sleep is None or sleep == tick else [*found, "sleep"]
+        if self._is_busy():  # what is under way arrives before time passes, unless it may be late
+            found += [("late", "")] if tick is not None else []
+        else:
+            found += [("tick", "")] if tick is not None else []
+            found += [("sleep", "")] if sleep is not None and sleep != tick else []
+        return [one for one in found if one[0] not in FAULTS or self.left.get(one[0])]
 
     def act(self, action: Action) -> None:
         """Let something happen. Raises what must not be raised."""
         verb, whose = action
         if verb in self.left:
             self.left[verb] -= 1
-        client = self.clients.get(whose)
-        if client is not None:
-            client.act(verb, self)
+        if whose in self.clients:
+            self.clients[whose].act(verb, self)
         else:
-            getattr(self, f"do_{verb.partition(' ')[0]}")(*verb.split()[1:], *whose.split())
-        self._check()
+            getattr(self, f"do_{verb}")(*whose.split())
+        if not self.scenario.talks:
+            self._deliver()
+        self._check(state_of(self.engine))
 
-    # -- the engine's side
+    def _deliver(self) -> None:
+        while mail := [one for one in self.clients.values() if one.has_mail()]:
+            mail[0].act("send" if mail[0].up else "hear", self)
+
+    # -- the engine
     def post(self, event: ev.Event) -> None:
         """Hand an event to the engine and perform what it asks, as the executor does."""
         self.now += STEP_S
         effects = self.engine.handle(event, self.now)
         check_arbiter(self.engine)
-        failed: list[fx.JournalPut] = []
-        for effect in self._written(effects, failed):
+        for effect in effects:
             match effect:
+                case fx.JournalPut(key, record, gates):
+                    self.journal[key] = record
+                    if gates and isinstance(record, LeaseRecord):
+                        self._check_token(record.token)
+                case fx.JournalDelete(key):
+                    self.journal.pop(key, None)
                 case fx.Reply(client, number, body):
                     self._tell(client, body, number)
                 case fx.Refuse(client, number, refusal):
@@ -291,59 +206,14 @@ class World:
                 case fx.Push(client, body):
                     self._tell(client, body, None)
                 case fx.Sample(gpu):
-                    self._sample(self.devices[gpu])
+                    self.devices[gpu].ask(self.now)
                 case _:
                     pass
-        for put in failed:
-            self.post(ev.JournalFailed(put.key, "full", put.gates))
 
-    def _written(
-        self, effects: list[fx.Effect], failed: list[fx.JournalPut]
-    ) -> Iterator[fx.Effect]:
-        """Write the journal, and yield what is performed although records may have `failed`."""
-        gone: dict[str, str] = {}
-        for effect in effects:
-            match effect:
-                case fx.JournalPut(key, record, gates):
-                    if gates:
-                        self._check_token(Token(*record.token))  # type: ignore[union-attr]
-                    if not self.disk_full:
-                        self.journal[key] = record
-                        continue
-                    failed.append(effect)
-                    if gates:
-                        gone[key.removeprefix("lease:")] = key
-                case fx.JournalDelete(key):
-                    if self.disk_full:
-                        self.owed.add(key)
-                    else:
-                        self.journal.pop(key, None)
-                case _:
-                    view = getattr(getattr(effect, "body", None), "lease", None)
-                    key = gone.get(getattr(view, "lease_id", ""), "")
-                    if not key:
-                        yield effect
-                    elif isinstance(effect, fx.Reply):
-                        lost = NotJournaled(key.removeprefix("lease:"), key, "full")
-                        yield fx.Refuse(effect.client, effect.request, lost)
-
-    def _tell(self, client: ClientId, told: Told, re: RequestId | None) -> None:
-        if re is not None:
-            self._reply = told  # type: ignore[assignment]
-        if (known := self.clients.get(client.partition("-")[0])) is not None:
-            known.hear(told, re, self.epoch)
-
-    def ask(self, client: Client, request: w.AnyRequest) -> AnyReply | Refusal | None:
-        """Send a request, and return its answer at once."""
-        self._requests += 1
-        self._reply = None
-        self.post(ev.Asked(client.client, RequestId(self._requests), request))
-        return self._reply
-
-    def admit(self, client: Client) -> None:
-        """A connection says hello."""
-        known = client.process, 1000, client.name, client.name
-        self.post(ev.ClientConnected(client.client, *known))
+    def _tell(self, to: ClientId, told: Told, re: RequestId | None) -> None:
+        client = self.clients.get(to.partition("-")[0])
+        if client is not None and client.client == to:
+            client.tell(told, re, self.epoch)
 
     def kill(self, process: ProcessKey) -> None:
         """A process dies: its bytes go, and the daemon will hear of it."""
@@ -352,117 +222,79 @@ class World:
         self.dead.add(process)
         self.unheard.append(process)
 
-    def _sample(self, device: Device) -> None:
-        if device.reading is None and not device.stuck:
-            device.begin(self.now)
-        else:
-            device.again = True
-
-    def _start(self) -> None:
+    # -- verbs of no client
+    def do_restart(self) -> None:
         """The daemon starts, perhaps after an earlier one."""
         self.epoch += 1
         self.engine = self.scenario.engine(_settings(self.scenario.gpus, self.epoch), self.now)
         for device in self.devices.values():
-            device.reading, device.again, device.stuck = None, False, False
-        self.unheard.clear()
+            device.reading, device.again = None, False
         for client in self.clients.values():
-            client.cut_off(self)
-        if not self.journal:
-            self.post(ev.Tick())
-            return
+            client.cut_off()
         records = dict(self.journal)
-        self.post(ev.Recovered(records))
-        self.unheard += sorted(set(processes_of(records)) & self.dead)
-
-    # -- verbs of no client
-    def do_restart(self) -> None:
-        self._start()
+        self.post(ev.Recovered(records) if records else ev.Tick())
+        self.unheard = sorted(set(processes_of(records)) & self.dead)
 
     def do_die(self, process: str) -> None:
         (found,) = [one for one in self.unheard if str(one) == process]
         self.unheard.remove(found)
         self.post(ev.ProcessDied(found))
 
-    def do_suspend(self) -> None:
-        self.post(ev.Resumed(60.0))
-
-    def do_stranger(self) -> None:
-        for device in self.devices.values():
-            device.set(STRANGER, 0 if STRANGER in device.held else STRANGER_BYTES, lags=False)
-
-    def do_full(self) -> None:
-        self.disk_full = True
-
-    def do_room(self) -> None:
-        self.disk_full = False
-        for key in self.owed:
-            self.journal.pop(key, None)
-        self.owed.clear()
-
     def do_return(self, gpu: str) -> None:
         self.devices[GpuId(gpu)].late.clear()
 
     def do_read(self, gpu: str) -> None:
-        self._answered(self.devices[GpuId(gpu)], None)
+        self._answer(self._reading(gpu))
 
     def do_fail(self, gpu: str) -> None:
-        self._answered(self.devices[GpuId(gpu)], ev.ProbeFailed(GpuId(gpu), self.now, "failed"))
+        self._answer(ev.ProbeFailed(GpuId(gpu), self.now, "failed"))
 
-    def do_lie(self, kind: str, gpu: str) -> None:
-        """A reading that shows an empty GPU, a full one, or what cannot be."""
+    def do_lie(self, gpu: str, lie: str) -> None:
         self.lied = True
-        total = CAPACITY_BYTES
-        device = self.devices[GpuId(gpu)]
-        assert device.reading is not None
-        used = {"less": 0, "more": total, "nonsense": 2 * total}[kind]
-        listed = () if kind == "less" else device.reading.processes
-        told = (device.gpu, device.reading.taken_at, used, total, listed)
-        self._answered(device, ev.MemorySampled(*told))
+        listed = () if lie == "nothing" else self._reading(gpu).processes
+        told = (LIES[lie], CAPACITY_BYTES, listed)
+        self._answer(ev.MemorySampled(GpuId(gpu), self._reading(gpu).taken_at, *told))
 
-    def do_answer(self, gpu: str) -> None:
-        """A reading that hung returns; a fresh one tells whether the GPU can be read."""
-        device = self.devices[GpuId(gpu)]
-        device.stuck = False
-        device.begin(self.now)
-
-    def _answered(self, device: Device, instead: ev.MemorySampled | ev.ProbeFailed | None) -> None:
-        """The reading under way is told, or something else in its place."""
-        reading, device.reading = device.reading, None
+    def _reading(self, gpu: str) -> ev.MemorySampled:
+        reading = self.devices[GpuId(gpu)].reading
         assert reading is not None
-        self.post(reading if instead is None else instead)
-        if device.again and device.reading is None:
-            device.begin(self.now)
+        return reading
+
+    def _answer(self, told: ev.MemorySampled | ev.ProbeFailed) -> None:
+        device = self.devices[told.gpu]
+        device.reading = None
+        self.post(told)
+        if device.again:
+            device.ask(self.now)
 
     # -- time
+    def _is_busy(self) -> bool:
+        return any(device.reading for device in self.devices.values()) or any(
+            client.has_mail() for client in self.clients.values()
+        )
+
     def _next_at(self) -> float | None:
-        """When time passes to by itself: the next deadline of the engine, of a client, or of a
-        reading that is late."""
-        late = [one.reading.taken_at + d.PROBE_DEADLINE_S for one in self._reading()]  # type: ignore[union-attr]
-        return self._first([self.engine.next_deadline(), *self._client_times(), *late])
+        """Return when something is due."""
+        times = [one.protocol.next_deadline() for one in self.clients.values()]
+        return self._first([at for at in (self.engine.next_deadline(), *times) if at is not None])
 
-    def _reading(self) -> list[Device]:
-        return [device for device in self.devices.values() if device.reading is not None]
-
-    def _client_times(self) -> list[float | None]:
-        return [client.next_deadline() for client in self.clients.values()]
-
-    def _first(self, times: list[float | None]) -> float | None:
-        soon = [at for at in times if at is not None and at < self.now + FAR_S]
-        return min(soon, default=None)
+    def _first(self, times: list[float]) -> float | None:
+        return min([at for at in times if at < self.now + FAR_S], default=None)
 
     def _decisive_at(self) -> float | None:
         """Return when something is due that is not done again and again."""
         core = state_of(self.engine)
-        times: list[float | None] = [*self._client_times()]
+        times = [at for one in self.clients.values() for at in one.decisive_times()]
         times += [at for (kind, _), at in core.timers.items() if kind not in _PERIODIC]
         for gpu in core.gpus.values():
             times += [one.deadline_at for one in gpu.verifications.values() if not one.overdue]
-            for lease in gpu.in_state(LeaseState.REVOKING):
-                asked = lease.departure.eviction
-                if asked is not None and not asked.overdue:
-                    times.append(asked.asked_at + core.settings.revoke_deadline_s)
             unloading = gpu.in_state(LeaseState.UNLOADING)
-            times += [core.timers.get(("revoke", lease.id)) for lease in unloading]
+            times += [
+                core.timers[key] for one in unloading if (key := ("revoke", one.id)) in core.timers
+            ]
+            asked = [one.departure.eviction for one in gpu.in_state(LeaseState.REVOKING)]
+            revoke_s = core.settings.revoke_deadline_s
+            times += [one.asked_at + revoke_s for one in asked if one and not one.overdue]
         return self._first(times)
 
     def do_tick(self) -> None:
@@ -470,52 +302,41 @@ class World:
         at = self._next_at()
         assert at is not None
         self.now = max(self.now, at)
-        for device in self._reading():
-            assert device.reading is not None
-            if self.now >= device.reading.taken_at + d.PROBE_DEADLINE_S:
-                device.reading, device.stuck = None, True
-                self.post(ev.ProbeFailed(device.gpu, self.now, "late"))
         for client in self.clients.values():
-            due = client.next_deadline()
-            if due is not None and due <= self.now:
-                client.tick(self)
+            client.tick(self.now)
         due = self.engine.next_deadline()
         if due is not None and due <= self.now:
             self.post(ev.Tick())
 
-    def do_late(self) -> None:
-        self.do_tick()
+    do_late = do_tick
 
     def do_sleep(self) -> None:
-        """Time passes to the next decisive moment; readings on the way are told as they are."""
-        until = self._decisive_at()
+        """Time passes to the next decisive moment; what is said on the way is as it should be."""
+        until, at = self._decisive_at(), self.now
         assert until is not None
-        for _event in range(SLEEP_EVENTS_MAX):
-            reading = self._reading()
-            for device in reading:
-                self._answered(device, None)
-            at = self._next_at()
-            if not reading and (at is None or at > until):
+        for _ in range(SLEEP_EVENTS_MAX):
+            if at >= until:
                 return
-            if not reading:
+            self._deliver()
+            for gpu in [device.gpu for device in self.devices.values() if device.reading]:
+                self.do_read(gpu)
+            if not self._is_busy():
+                at = self._next_at() or until
                 self.do_tick()
-                if at == until or any(client.has_mail() for client in self.clients.values()):
-                    return
 
     # -- what must hold
-    def _check_token(self, token: Token) -> None:
+    def _check_token(self, token: tuple[int, int]) -> None:
         if token <= self.last_token:
             raise Broken(f"token {token} was granted after {self.last_token}")
         self.last_token = token
 
-    def _check(self) -> None:
-        core = state_of(self.engine)
+    def _check(self, core: Core) -> None:
         for client in self.clients.values():
-            client.check(core, self.clients.values())
+            client.check(core)
         for gpu_id, device in self.devices.items():
-            if not self.lied:
-                self._check_bytes(core, gpu_id, device)
             gpu = core.gpus[gpu_id]
+            if not self.lied:
+                self._check_bytes(core, device)
             head = gpu.queue.head
             if head is None or core.blocked(gpu) or gpu.asked_at is not None:
                 continue
@@ -524,18 +345,18 @@ class World:
             if admission.fits(gpu, head) and room is not None and room >= needed:
                 raise Broken(f"{head.id} fits on {gpu_id} and is not granted")
 
-    def _check_bytes(self, core: Core, gpu: GpuId, device: Device) -> None:
-        shown = device.shown()
-        total = OVERHEAD_BYTES + sum(shown.values())
-        ledger = core.gpus[gpu].ledger
-        for client in self.clients.values():
-            total += client.coming_bytes(gpu, device.held.get(client.process, 0))
+    def _check_bytes(self, core: Core, device: Device) -> None:
+        """What is granted or occupied fits; what a process with a lease holds is charged."""
+        total, clients = device.used_bytes(), self.clients.values()
+        total += sum(
+            one.coming_bytes(device.gpu, device.held.get(one.process, 0)) for one in clients
+        )
         if total > CAPACITY_BYTES:
-            raise Broken(f"{total} bytes are granted or occupied on {gpu}: {shown}")
-        excused = {one.process for one in self.clients.values() if one.is_excused()}
-        for process, held_bytes in device.held.items():
-            account = ledger.accounts.get(process)
-            charged = 0 if account is None else account.charged_bytes
-            slack = 0 if device.lists else d.RESERVE_BYTES + d.VERIFY_TOLERANCE_BYTES
-            if process not in {STRANGER, *excused} and held_bytes > charged + slack:
-                raise Broken(f"{process} holds {held_bytes} bytes on {gpu}, {charged} are charged")
+            raise Broken(f"{total} bytes are granted or occupied on {device.gpu}")
+        accounts = core.gpus[device.gpu].ledger.accounts
+        slack = 0 if device.lists else d.RESERVE_BYTES + d.VERIFY_TOLERANCE_BYTES
+        for process, held in device.held.items():
+            charged = accounts[process].charged_bytes if process in accounts else 0
+            excused = any(one.over for one in clients if one.process == process)
+            if held > charged + slack and not excused:
+                raise Broken(f"{process} holds {held} bytes on {device.gpu}, {charged} are charged")
