@@ -1,7 +1,6 @@
 """The explorer itself: a tiny world to its end, a seeded defect by its shortest story, and which
 worlds count as the same."""
 
-
 import pytest
 
 from tests.explore.client import Broken
@@ -45,7 +44,7 @@ class Credulous(Arbiter):
 # -- the search
 def test_a_tiny_world_is_explored_to_its_end() -> None:
     report = Search(ONE).run(60.0)
-    assert report.failure is None
+    assert not report.error
     assert report.complete
     assert report.unproven == 0
     assert report.transitions == report.merged + report.states - 1
@@ -56,13 +55,13 @@ def test_a_defect_is_found_with_its_shortest_story() -> None:
     """The driver still has the bytes of the first client when the second one is granted them."""
     scenario = Scenario("credulous", (BIG, BIG), lags=True, engine=Credulous)
     report = Search(scenario).run(60.0)
-    assert report.failure is not None
+    assert report.error
     expected = "acquire a, load a, ready a, leave a, free a, acquire b"
-    assert report.failure.story == story(expected)
-    assert "are granted or occupied" in report.failure.error
-    assert "play(SCENARIOS['credulous'], [('acquire', 'a')" in report.failure.told("credulous")
+    assert report.story == story(expected)
+    assert "are granted or occupied" in report.error
+    assert "play(SCENARIOS['credulous'], [('acquire', 'a')" in str(report)
     with pytest.raises(Broken, match="are granted or occupied"):
-        play(scenario, report.failure.story)
+        play(scenario, report.story)
 
 
 class Blind(Arbiter):
@@ -76,9 +75,9 @@ class Blind(Arbiter):
 
 def test_a_waiter_that_no_path_serves_is_found() -> None:
     report = Search(Scenario("blind", (BIG,), engine=Blind)).run(60.0)
-    assert report.failure is not None
-    assert report.failure.story == story("acquire a")
-    assert report.failure.error == "no path serves those that wait"
+    assert report.error
+    assert report.story == story("acquire a")
+    assert report.error == "no path serves those that wait"
 
 
 # -- copies

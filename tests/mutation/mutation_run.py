@@ -113,12 +113,9 @@ def choose(
     `only`: their names and diffs."""
     found = [item for path in sorted(folder.rglob("*.py")) for item in _of_file(path)]
     if only:
-        chosen = _again(found, only)
-        return len(found), chosen
-    if 0 < sample < len(found):
-        chosen = random.Random(seed).sample(found, sample)
-    else:
-        chosen = found
+        return len(found), _again(found, only)
+    some = 0 < sample < len(found)
+    chosen = random.Random(seed).sample(found, sample) if some else found
     return len(found), [_materialise(*item) for item in chosen]
 
 
@@ -226,7 +223,7 @@ class Coverage:
     def __init__(self) -> None:
         self.tests: dict[str, set[str]] = {}  # "file:line" → the tests that come by
         self.durations: dict[str, float] = {}
-        self._lines: set[tuple[str, int]] = set()
+        self.lines: set[tuple[str, int]] = set()
         self._tool = sys.monitoring.COVERAGE_ID
         sys.monitoring.use_tool_id(self._tool, "mutation")
         sys.monitoring.register_callback(self._tool, sys.monitoring.events.LINE, self._line)
@@ -234,16 +231,16 @@ class Coverage:
 
     def _line(self, code: CodeType, line: int) -> object:
         if IMPORTED in code.co_filename:
-            self._lines.add((Path(code.co_filename).stem, line))
+            self.lines.add((Path(code.co_filename).stem, line))
         return sys.monitoring.DISABLE  # until the next test
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         self.durations[report.nodeid] = self.durations.get(report.nodeid, 0.0) + report.duration
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
-        for stem, line in self._lines:
+        for stem, line in self.lines:
             self.tests.setdefault(f"{stem}:{line}", set()).add(nodeid)
-        self._lines.clear()
+        self.lines.clear()
         sys.monitoring.restart_events()
 
 
@@ -364,8 +361,8 @@ def explored(seconds: float) -> str:
     """Explore each scenario for its share of the time. Return the first failure; "" for none."""
     for name, scenario in SCENARIOS.items() if seconds else ():
         report = Search(scenario).run(seconds / len(SCENARIOS))
-        if report.failure is not None:
-            return f"explore {name}: {report.failure.error}"
+        if report.error:
+            return f"explore {name}: {report.error}"
     return ""
 
 
