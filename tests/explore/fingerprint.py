@@ -23,6 +23,7 @@ from enum import Enum
 from hashlib import blake2b
 from marshal import dumps
 from operator import attrgetter
+from types import NoneType
 from typing import Any
 
 from tests.explore.client import Client
@@ -74,6 +75,7 @@ LEFT_OUT: Mapping[type, str] = {
     RevokePush: "deadline_in_s uses reason priority traceparent",
     Acquire: "nonce wait_timeout_s",
 }
+_PLAIN = frozenset({int, bool, float, NoneType})
 _NOISE = frozenset({"seq", "epoch", "message", "hint", "details", "instance", "nonce", "pid"})
 """Of messages."""
 type Names = dict[object, int]
@@ -115,13 +117,16 @@ class _Part:
         self.row: list[Any] = []
 
     def put(self, *values: Any) -> None:
-        append = self.row.append
+        append, names = self.row.append, self.names
         for value in values:
             kind = type(value)
-            if kind is int or kind is bool or value is None:
+            if kind in _PLAIN:
                 append(value)
-            elif kind is float:
-                append(value or 0)
+            elif kind is str:
+                named = names.get(value)
+                if named is None and value[:1] == "L" and value[1:2].isdigit():
+                    named = self.name(value)  # a lease
+                append(value if named is None else named)
             else:
                 _WRITERS[kind](self, value)
 
@@ -131,7 +136,7 @@ class _Part:
 
     def sealed(self, now: float) -> tuple[Any, ...]:
         """Return the row, with moments as their places: below zero those that are over."""
-        moments = sorted({value for value in self.row if type(value) is float})
+        moments = sorted({value for value in self.row if type(value) is float})  # 0.0: never
         far, over = bisect(moments, now + FAR_S), bisect(moments, now)
         places = {at: f"{n - over}" if n < far else "far" for n, at in enumerate(moments)}
         return tuple([places[value] if type(value) is float else value for value in self.row])
@@ -151,10 +156,8 @@ _WRITERS = _Writers()
 
 
 def _writer(kind: type) -> _Writer:
-    if kind is str:
-        return _text
     if issubclass(kind, Enum):
-        return lambda part, value: part.row.append(value.value)
+        return lambda part, value: part.row.append(value._value_)
     if kind in (ProcessKey, Token):
         return lambda part, value: part.row.append(part.name(value))
     if kind is LeaseSpec:
@@ -174,11 +177,6 @@ def _sorted(part: _Part, keys: Any) -> list[Any]:
     return sorted(keys, key=lambda key: str(part.names.get(key, key))) if len(keys) > 1 else [*keys]
 
 
-def _text(part: _Part, value: str) -> None:
-    is_lease = value[:1] == "L" and value[1:2].isdigit()
-    part.row.append(part.name(value) if is_lease else part.names.get(value, value))
-
-
 def _record_writer(kind: type) -> _Writer:
     left_out = LEFT_OUT.get(kind, "").split()
     getters: list[Callable[[Any], Any]] = []  # made with the first value: it knows its fields
@@ -187,7 +185,7 @@ def _record_writer(kind: type) -> _Writer:
         if not getters:
             every = [one.name for one in fields(value)] if is_dataclass(value) else vars(value)
             names = [name for name in every if name not in left_out]
-            getters.append(attrgetter(*names, "__class__.__name__"))
+            getters.append(attrgetter(*names, *names[:1]))  # a tuple, also of a single one
         part.put(*getters[0](value))
 
     return write
