@@ -29,52 +29,29 @@ from typing import Any
 from tests.explore.client import Client
 from tests.explore.world import FAR_S, Device, World
 from tests.support.engine_state import state_of
-from vram_arbiter.arbiter.core.events import MemorySampled
-from vram_arbiter.arbiter.core.ledger import Account, Charge, GpuLedger
 from vram_arbiter.arbiter.core.model import lease as m
 from vram_arbiter.arbiter.core.model.gpu import Gpu
-from vram_arbiter.arbiter.core.model.records import LeaseRecord, ResidueRecord
+from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.arbiter.core.model.state import Core
-from vram_arbiter.clients._protocol import records as r
-from vram_arbiter.clients._protocol.connection import Connection
-from vram_arbiter.clients._protocol.leases import Holdings
-from vram_arbiter.clients._protocol.protocol import ClientProtocol
-from vram_arbiter.clients._protocol.waits import Waits
 from vram_arbiter.schemas.ids import ProcessKey, Token
-from vram_arbiter.schemas.wire.pushes import RevokePush
-from vram_arbiter.schemas.wire.requests import Acquire
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
-LEFT_OUT: Mapping[type, str] = {
-    m.Lease: "request uses story held_from id",
-    m.Request: "nonce arrival arrived_at uid id traceparent reason wait_timeout_s evicted"
-    " earlier_nonces",
-    m.Eviction: "consumer charge_bytes unloading_at released_at verdict_at traceparent",
-    m.Observed: "grew_at drifted",
-    m.Use: "label began_at",
-    m.Verification: "key consumer model",
-    Account: "leased_bytes leased_approved_bytes charged_bytes approved_bytes held_bytes",
-    Charge: "account",
-    GpuLedger: "tolerance_bytes info budget_bytes charges touched stowaway_bytes charged_bytes"
-    " approved_bytes _held_bytes",
-    Gpu: "info queue readings residents verifications left reading_s failure blocked debts dirty"
-    " touched",
-    MemorySampled: "total_bytes",
-    LeaseRecord: "lease_id token pid start_ticks nonce spec held_from users",
-    ResidueRecord: "pid start_ticks",
-    Client: "name spec client connections lives protocol up down record awaited",
-    ClientProtocol: "foreign_uses",
-    Connection: "_above _hello _ids outgoing events instance epoch heartbeat_s grace_s _pending"
-    " _handshake_id _handshake_at _heard_at",
-    Holdings: "_connection",
-    Waits: "_connection _holdings",
-    r.LeaseRecord: "nonce spec view ttl_s wanted_by reacquire_id renewed_at",
-    r.Waiter: "nonce spec traceparent asked_at request_id",
-    r.Pending: "id traceparent deadline on_reply on_error",
-    Device: "lists",
-    RevokePush: "deadline_in_s uses reason priority traceparent",
-    Acquire: "nonce wait_timeout_s",
+_LEFT_OUT_BECAUSE: Mapping[str, str] = {
+    "it is written elsewhere, or a sum": "request spec id key info queue readings residents left"
+    " verifications touched debts dirty blocked account leased_bytes leased_approved_bytes"
+    " total_bytes budget_bytes tolerance_bytes",
+    "it is a number, or words": "story nonce arrival arrived_at uid reason traceparent label began_at"
+    " failure name consumer model earlier_nonces",
+    "it is learned, or told alone": "grew_at drifted reading_s evicted charge_bytes held_from"
+    " unloading_at released_at verdict_at wait_timeout_s",
+    "it is of the protocol, and never changes": "foreign_uses _above _hello _connection _holdings"
+    " instance epoch heartbeat_s grace_s view ttl_s wanted_by deadline_in_s priority lists",
+    "it is of the protocol, and an order of messages": "connections lives protocol up down record"
+    " awaited _ids outgoing events _pending _handshake_id _handshake_at _heard_at reacquire_id"
+    " request_id renewed_at deadline on_reply on_error",
 }
+LEFT_OUT = frozenset(name for names in _LEFT_OUT_BECAUSE.values() for name in names.split())
+"""Fields of any record by name."""
 _PLAIN = frozenset({int, bool, float, NoneType})
 _NOISE = frozenset({"seq", "epoch", "message", "hint", "details", "instance", "nonce", "pid"})
 """Of messages."""
@@ -170,21 +147,20 @@ def _writer(kind: type) -> _Writer:
         return lambda part, some: part.put(len(some), *_sorted(part, some))
     if issubclass(kind, list | tuple | deque):
         return lambda part, some: part.put(len(some), *some)
-    return _record_writer(kind)
+    return _record_writer()
 
 
 def _sorted(part: _Part, keys: Any) -> list[Any]:
     return sorted(keys, key=lambda key: str(part.names.get(key, key))) if len(keys) > 1 else [*keys]
 
 
-def _record_writer(kind: type) -> _Writer:
-    left_out = LEFT_OUT.get(kind, "").split()
+def _record_writer() -> _Writer:
     getters: list[Callable[[Any], Any]] = []  # made with the first value: it knows its fields
 
     def write(part: _Part, value: Any) -> None:
         if not getters:
             every = [one.name for one in fields(value)] if is_dataclass(value) else vars(value)
-            names = [name for name in every if name not in left_out]
+            names = [name for name in every if name not in LEFT_OUT]
             getters.append(attrgetter(*names, *names[:1]))  # a tuple, also of a single one
         part.put(*getters[0](value))
 
@@ -241,7 +217,7 @@ def _gpu(core: Core, gpu: Gpu, device: Device, names: Names) -> _Part:
 
 def _lease(part: _Part, core: Core, lease: m.Lease) -> None:
     request = lease.request
-    part.put(lease.id, lease, list(lease.uses.values()), lease.uses.unclaimed)
+    part.put(lease.id, lease, lease.uses.unclaimed)
     if lease.state is m.LeaseState.QUEUED:
         part.put(request, request.id is None)
     else:
@@ -261,12 +237,15 @@ def _rest(world: World, core: Core, names: Names) -> _Part:
     part.put(core.costs.failures, world.left, world.lied, world.unheard)
     part.put({lease: core.ended[lease].state for lease in core.ended if lease in names})
     if world.left.get("restart"):
-        for key in sorted(
-            world.journal, key=lambda key: str(part.names.get(key.partition(":")[2], key))
-        ):
-            record: Any = world.journal[key]
-            if isinstance(record, LeaseRecord):
-                users = {ProcessKey(pid, ticks) for pid, ticks, _, _ in record.users}
-                part.put(record.lease_id, users)
-            part.put(ProcessKey(record.pid, record.start_ticks), record)
+        for key in _sorted(part, {key.partition(":")[2]: key for key in world.journal}):
+            _journaled(part, world.journal[f"lease:{key}" if key[0] == "L" else f"residue:{key}"])
     return part
+
+
+def _journaled(part: _Part, record: Any) -> None:
+    part.put(ProcessKey(record.pid, record.start_ticks), record.gpu)
+    if isinstance(record, LeaseRecord):
+        part.put(record.lease_id, record.state, record.charge_bytes, record.measured_bytes)
+        part.put(record.comes_back, [ProcessKey(pid, ticks) for pid, ticks, _, _ in record.users])
+    else:
+        part.put(record.residue_bytes, record.floor_bytes)
