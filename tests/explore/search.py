@@ -80,7 +80,7 @@ def serve(world: World) -> bool:
     for step in range(1, SERVE_STEPS_MAX):
         if not _waits(world):
             return True
-        verbs = SERVE if step % 20 else SERVE[::-1]  # so that time passes in any case
+        verbs = SERVE if step % 15 else SERVE[::-1]  # so that time passes in any case
         able = {verb: (verb, whose) for verb, whose in world.actions()}
         world.act(next(able[verb] for verb in verbs if verb in able))
     return False

@@ -22,6 +22,7 @@ from vram_arbiter.arbiter.core.model.records import AnyRecord, LeaseRecord
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
+from vram_arbiter.arbiter.core.verification.judge import DYING_S
 from vram_arbiter.arbiter.host.records import processes_of
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
@@ -32,7 +33,7 @@ CAPACITY_BYTES, OVERHEAD_BYTES = 8 * d.GIB, 100 * d.MIB
 START_S, STEP_S = 1024.0, 2.0**-20
 FOR_EVER_S, FAR_S = 3600.0, 600.0
 """The longest time to live; what is due so much later is not waited for."""
-SLEEP_EVENTS_MAX = 400
+SLEEP_EVENTS_MAX = 1000
 QUICK: Mapping[str, Any] = {
     "ageing_s_per_point": 1e6,
     "revoke_resend_s": 1.0,
@@ -287,7 +288,8 @@ class World:
         times = [at for one in self.clients.values() for at in one.decisive_times()]
         times += [at for (kind, _), at in core.timers.items() if kind not in _PERIODIC]
         for gpu in core.gpus.values():
-            times += [one.deadline_at for one in gpu.verifications.values() if not one.overdue]
+            debts = gpu.verifications.values()
+            times += [one.deadline_at + DYING_S * one.overdue for one in debts]
             unloading = gpu.in_state(LeaseState.UNLOADING)
             times += [
                 core.timers[key] for one in unloading if (key := ("revoke", one.id)) in core.timers
@@ -295,7 +297,7 @@ class World:
             asked = [one.departure.eviction for one in gpu.in_state(LeaseState.REVOKING)]
             revoke_s = core.settings.revoke_deadline_s
             times += [one.asked_at + revoke_s for one in asked if one and not one.overdue]
-        return self._first(times)
+        return self._first([at for at in times if at > self.now])
 
     def do_tick(self) -> None:
         """Time passes to the next deadline, which is served."""
@@ -312,17 +314,18 @@ class World:
 
     def do_sleep(self) -> None:
         """Time passes to the next decisive moment; what is said on the way is as it should be."""
-        until, at = self._decisive_at(), self.now
+        until = self._decisive_at()
         assert until is not None
         for _ in range(SLEEP_EVENTS_MAX):
-            if at >= until:
-                return
             self._deliver()
             for gpu in [device.gpu for device in self.devices.values() if device.reading]:
                 self.do_read(gpu)
-            if not self._is_busy():
-                at = self._next_at() or until
-                self.do_tick()
+            if self._is_busy():
+                continue
+            at = self._next_at()
+            if at is None or at > until:
+                return
+            self.do_tick()
 
     # -- what must hold
     def _check_token(self, token: tuple[int, int]) -> None:
