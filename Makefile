@@ -14,8 +14,9 @@ SECONDS ?= 300
 # Histories of `make nightly`, of all rule machines together; MACHINE: one of them alone.
 HISTORIES ?= 100000
 MACHINE ?=
-# Mutants of `make mutation`; 0: all.
+# Mutants of `make mutation`; 0: all. EXPLORE: seconds of exploration for each that no test notices.
 SAMPLE ?= 300
+EXPLORE ?= 60
 
 BIN := .venv/bin
 CORE := .venv-core/bin
@@ -28,7 +29,7 @@ BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help setup setup-core setup-worlds setup-vllm jetson demo test test-core test-gpu nightly mutation measure lint format \
-	chaos sim bench bench-doors bench-gateway bench-switch schemas docs clean
+	explore chaos sim bench bench-doors bench-gateway bench-switch schemas docs clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -66,8 +67,12 @@ nightly: setup setup-worlds setup-vllm ## random histories of the engine: HISTOR
 	$(TOOL) tests/nightly/nightly_run.py --histories $(HISTORIES) \
 		$(if $(MACHINE),--machine $(MACHINE)) $(if $(filter-out 0,$(SEED)),--seed $(SEED)) $(ARGS)
 
-mutation: setup ## small changes in arbiter/core that no core test notices: SAMPLE=300 SEED=n
-	$(TOOL) tests/mutation/mutation_run.py --sample $(SAMPLE) --seed $(SEED) $(ARGS)
+explore: MINUTES = 60
+explore: setup ## all orders of events of small worlds: MINUTES=60 WORLD=turns
+	$(TOOL) -m tests.explore.explore_run --minutes $(MINUTES) $(addprefix --world ,$(WORLD)) $(ARGS)
+
+mutation: setup ## small changes in arbiter/core that no core test notices: SAMPLE=300 SEED=n EXPLORE=60
+	$(TOOL) tests/mutation/mutation_run.py --sample $(SAMPLE) --seed $(SEED) --explore $(EXPLORE) $(ARGS)
 
 measure: setup ## how long the path of a request is, and what one more request touches
 	$(TOOL) tests/measure_path.py

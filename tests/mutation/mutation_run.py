@@ -9,7 +9,8 @@ and those that mean the same stand in `equivalent.json` beside this file, each w
 pytest collects once. Each mutant is tried in a fork of that process: the mutant's bytecode takes
 the place of the function's, so whoever imported the function has the mutant, and only the tests
 themselves cost time. The rule machines are left out: they are slow, and what only they kill
-deserves a test with a name.
+deserves a test with a name. With `--explore 60`, what no test kills is tried by so many seconds of
+`tests.explore`; the report names the world that kills it.
 """
 
 import argparse
@@ -36,6 +37,9 @@ from types import CodeType, FunctionType
 from typing import Any, NoReturn
 
 import pytest
+
+from tests.explore.scenarios import SCENARIOS
+from tests.explore.search import Search
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = ROOT / "arbiter/core"
@@ -109,12 +113,9 @@ def choose(
     `only`: their names and diffs."""
     found = [item for path in sorted(folder.rglob("*.py")) for item in _of_file(path)]
     if only:
-        chosen = _again(found, only)
-        return len(found), chosen
-    if 0 < sample < len(found):
-        chosen = random.Random(seed).sample(found, sample)
-    else:
-        chosen = found
+        return len(found), _again(found, only)
+    some = 0 < sample < len(found)
+    chosen = random.Random(seed).sample(found, sample) if some else found
     return len(found), [_materialise(*item) for item in chosen]
 
 
@@ -222,7 +223,7 @@ class Coverage:
     def __init__(self) -> None:
         self.tests: dict[str, set[str]] = {}  # "file:line" → the tests that come by
         self.durations: dict[str, float] = {}
-        self._lines: set[tuple[str, int]] = set()
+        self.lines: set[tuple[str, int]] = set()
         self._tool = sys.monitoring.COVERAGE_ID
         sys.monitoring.use_tool_id(self._tool, "mutation")
         sys.monitoring.register_callback(self._tool, sys.monitoring.events.LINE, self._line)
@@ -230,16 +231,16 @@ class Coverage:
 
     def _line(self, code: CodeType, line: int) -> object:
         if IMPORTED in code.co_filename:
-            self._lines.add((Path(code.co_filename).stem, line))
+            self.lines.add((Path(code.co_filename).stem, line))
         return sys.monitoring.DISABLE  # until the next test
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         self.durations[report.nodeid] = self.durations.get(report.nodeid, 0.0) + report.duration
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
-        for stem, line in self._lines:
+        for stem, line in self.lines:
             self.tests.setdefault(f"{stem}:{line}", set()).add(nodeid)
-        self._lines.clear()
+        self.lines.clear()
         sys.monitoring.restart_events()
 
 
@@ -247,8 +248,11 @@ class Trials:
     """A pytest plugin that runs, for each mutant and in a fork, the tests that come by its lines,
     until one fails."""
 
-    def __init__(self, mutants: list[Mutant], jobs: int, folder: Path) -> None:
+    def __init__(
+        self, mutants: list[Mutant], jobs: int, folder: Path, explore_s: float = 0.0
+    ) -> None:
         self.mutants = mutants
+        self.explore_s = explore_s
         self.jobs = jobs
         self.folder = folder
         self.failed = ""
@@ -326,6 +330,8 @@ class Trials:
                 if self.failed:
                     break
             else:
+                self.failed = "" if mutant is None else explored(self.explore_s)
+            if not self.failed:
                 status = SURVIVED
                 then()
         finally:
@@ -351,7 +357,16 @@ class Trials:
             )
 
 
-def run(mutants: list[Mutant], jobs: int) -> None:
+def explored(seconds: float) -> str:
+    """Explore each scenario for its share of the time. Return the first failure; "" for none."""
+    for name, scenario in SCENARIOS.items() if seconds else ():
+        report = Search(scenario).run(seconds / len(SCENARIOS))
+        if report.error:
+            return f"explore {name}: {report.error}"
+    return ""
+
+
+def run(mutants: list[Mutant], jobs: int, explore_s: float) -> None:
     """Try all mutants, `jobs` at a time; each knows its outcome afterwards."""
     options = [
         TESTS,
@@ -365,7 +380,7 @@ def run(mutants: list[Mutant], jobs: int) -> None:
     limits = ["-o", f"timeout={TEST_TIMEOUT_S}", "-o", "faulthandler_timeout=0"]
     os.chdir(ROOT)
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()) as said:
-        trials = Trials(mutants, jobs, Path(folder))
+        trials = Trials(mutants, jobs, Path(folder), explore_s)
         pytest.main([*options, *limits], plugins=[trials])
     if any(not mutant.outcome for mutant in mutants):
         raise SystemExit(trials.problem or f"{said.getvalue()}\nnot every mutant was tried")
@@ -402,6 +417,9 @@ def main() -> int:
         "--sample", type=int, default=300, help="this many by chance; 0: all (hours)"
     )
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--explore", type=float, default=0.0, help="seconds of exploration for each survivor"
+    )
     parser.add_argument("--again", type=Path, help="the survivors of this report")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--out", type=Path, default=ROOT / "out/mutation/report.json")
@@ -414,7 +432,7 @@ def main() -> int:
     existing, mutants = choose(options.sample, options.seed, only)
     print(f"{existing} mutants, {len(mutants)} of them are tried", flush=True)
     known = json.loads(KNOWN.read_text())
-    run(mutants, options.jobs)
+    run(mutants, options.jobs, options.explore)
     report = summary_of(existing, sorted(mutants, key=lambda mutant: mutant.name), known)
     report |= {"seed": options.seed, "wall_s": round(time.perf_counter() - began, 1)}
     options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -106,3 +106,15 @@ def test_a_mutant_that_no_test_comes_by_survives(tmp_path: Path) -> None:
     if not (pid := os.fork()):
         mutants_run.Trials([], 1, tmp_path)._run([], None)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == mutants_run.SURVIVED
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")  # it forks on purpose
+def test_an_exploration_kills_what_no_test_comes_by(tmp_path: Path) -> None:
+    """An acquire that waits in no queue is found within the first events of the first world."""
+    source = (mutants_run.CORE / "requests/requests.py").read_text()
+    mutated = source.replace("core.enqueue(_new_lease(", "id(_new_lease(")
+    mutant = mutants_run.Mutant("requests.acquire:1", "requests", [], "", mutated)
+    if not (pid := os.fork()):
+        mutants_run.Trials([], 1, tmp_path, explore_s=1e6)._run([], mutant)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == mutants_run.KILLED
+    assert (tmp_path / str(pid)).read_text().startswith("explore turns: ")

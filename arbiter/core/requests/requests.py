@@ -295,12 +295,12 @@ def note_refused(
 def ready(core: Core, asked: ev.Asked, request: w.Ready) -> None:
     """Mark a lease loaded: from now on its steady bytes are charged, or what its holder measured.
 
-    A repeat is answered again.
+    A repeat is answered again, also once the holder is revoked.
     """
     lease = own_lease(core, asked.client, request)
-    if lease.state not in (LeaseState.LOADING, LeaseState.HELD):
+    if lease.state not in (LeaseState.LOADING, LeaseState.HELD, LeaseState.REVOKING):
         raise bad_state(lease, Misfit.NOT_LOADING)
-    repeated = lease.state is LeaseState.HELD
+    repeated = lease.state is not LeaseState.LOADING
     if not repeated:
         become_held(core, lease, request.measured_bytes)
     core.reply(asked.client, asked.id, ReadyReply(status.view(core, lease)))

@@ -209,6 +209,20 @@ def test_ready_charges_the_steady_bytes_or_what_was_measured(driver: CoreDriver)
     assert refusal(vlm.ready(second)).code == "bad_state"
 
 
+def test_ready_may_be_repeated_by_a_holder_that_is_revoked(driver: CoreDriver) -> None:
+    """The answer to its first `ready` was lost with the connection, and a waiter came. It was
+    refused then, and the program saw an error for a load that had succeeded."""
+    det, vlm = driver.consumer("det"), driver.consumer("vlm")
+    lease = det.acquire(5 * GIB)
+    det.load(lease)
+    vlm.acquire(5 * GIB)
+    driver.advance(0.01)
+    assert driver.state(lease) == "revoking"
+    repeated = det.ready(lease)
+    assert kinds(repeated) == ["Reply"]
+    assert answer(repeated)["lease"]["state"] == "revoking"
+
+
 # -- uses
 def test_uses_are_idempotent_and_counted_per_process(driver: CoreDriver) -> None:
     det, runner = driver.consumer("det"), driver.consumer("runner")

@@ -1,0 +1,48 @@
+"""The worlds that are explored, small ones first. Each says in its name what it is about."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from tests.explore.world import FOR_EVER_S, Scenario
+from vram_arbiter.schemas.defaults import GIB, MIB
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
+
+
+def kind(name: str, peak: int, steady: int = 0, residue: int = 0, **spec: Any) -> LeaseSpec:
+    """Return what clients of a kind ask for, in bytes: no residency, a time to live without end."""
+    usual = {"ttl_s": FOR_EVER_S, "min_residency_s": 0.0}
+    sizes = Footprint(peak, steady or peak, residue)
+    return LeaseSpec(consumer=name, model_id=name, footprint=sizes, **(usual | spec))
+
+
+BIG, SMALL = kind("big", 5 * GIB), kind("small", 3 * GIB)
+PEAKY = kind("peaky", 6 * GIB, 3 * GIB, 450 * MIB)
+URGENT = kind("urgent", 5 * GIB, priority=60)
+ALONE = kind("alone", 3 * GIB, mode="exclusive")
+RETURNS = kind("returns", 5 * GIB, standby=True)
+STAYS = kind("stays", 3 * GIB, evictable=False)
+TALKS = kind("talks", 5 * GIB, ttl_s=12.0)
+FAULTS = {"crash": 1, "restart": 1, "late": 1, "fail": 1, "cancel": 1, "lie": 1}
+
+SCENARIOS: Mapping[str, Scenario] = {
+    one.name: one
+    for one in (
+        Scenario("turns", (BIG, BIG)),
+        Scenario("timeout", (BIG, BIG), wait_timeout_s=3.0),
+        Scenario("cancel", (BIG, BIG), acquires=2, faults={"cancel": 1}),
+        Scenario("stays", (STAYS, ALONE), faults={"cancel": 1}),
+        Scenario("readings", (BIG, BIG), faults={"late": 1, "fail": 1, "lie": 1}),
+        Scenario("standby", (RETURNS, BIG), acquires=2),
+        Scenario("crash", (BIG, PEAKY), faults={"crash": 1, "late": 1}, lags=True),
+        Scenario("restart", (BIG, PEAKY), faults={"restart": 1, "crash": 1}),
+        Scenario("blind", (BIG, PEAKY), faults={"fail": 1}, lists=False, lags=True),
+        Scenario("talk", (TALKS,), faults={"drop": 2}, talks=True),
+        Scenario("talk-turns", (TALKS, TALKS), faults={"drop": 1}, talks=True),
+        Scenario("talk-restart", (TALKS, TALKS), faults={"restart": 1, "late": 1}, talks=True),
+        Scenario("three", (BIG, BIG, BIG)),
+        Scenario("kinds", (BIG, PEAKY, ALONE), faults={"crash": 1}),
+        Scenario("two-gpus", (BIG, BIG, BIG), gpus=2),
+        Scenario("placed", (BIG, URGENT, SMALL), gpus=2, faults={"crash": 1, "cancel": 1}),
+        Scenario("everything", (BIG, PEAKY, URGENT), gpus=2, acquires=2, faults=FAULTS),
+    )
+}
