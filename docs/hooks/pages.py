@@ -28,6 +28,7 @@ ROOT_PAGES = {
     "CHANGELOG.md": "reference/changelog.md",
     "CONTRIBUTING.md": "explanation/contributing.md",
     "README.md": "explanation/readme.md",
+    "SECURITY.md": "explanation/security.md",
 }
 SCHEMAS = "schemas/json/"
 # Front matter of pages that the search leaves out: their names are explained on other pages, and
