@@ -28,7 +28,7 @@ BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help setup setup-core setup-worlds setup-vllm jetson demo test test-core test-gpu nightly mutation measure lint format \
-	chaos sim bench bench-doors bench-gateway bench-switch schemas docs clean
+	lock wheel chaos sim bench bench-doors bench-gateway bench-switch schemas docs clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -107,6 +107,9 @@ schemas: setup ## write the JSON Schemas after a model changed
 
 docs: setup ## the documentation site in build/site; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+wheel: setup ## dist/vram_arbiter-*.whl, the same bytes wherever it is built
+	$(BIN)/python -m hatchling build -t wheel
 
 clean: ## remove environments, caches and outputs
 	rm -rf .venv .venv-core .venv-worlds .venv-vllm build dist out .coverage
