@@ -7,8 +7,10 @@ GPU ?= fake:8GiB
 OUT ?= out/demo
 ARGS ?=
 QUICK ?=
-# Minutes of turns on each program of `make bench-gateway`.
+# Minutes of turns on each program of `make bench-gateway`, and of `make fuzz` altogether.
 MINUTES ?= 10
+# Of `make fuzz`: one parser alone.
+TARGET ?=
 # Seconds of `make chaos`.
 SECONDS ?= 300
 # Histories of `make nightly`, of all rule machines together; MACHINE: one of them alone.
@@ -27,8 +29,8 @@ WORKERS ?= 4
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core setup-worlds setup-vllm jetson demo test test-core test-gpu nightly mutation measure lint format \
-	lock wheel chaos sim bench bench-doors bench-gateway bench-switch schemas docs clean
+.PHONY: help setup setup-core setup-worlds setup-vllm jetson demo test test-core test-gpu nightly mutation fuzz measure lint format \
+	sbom wheel chaos sim bench bench-doors bench-gateway bench-switch schemas docs clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -69,6 +71,9 @@ nightly: setup setup-worlds setup-vllm ## random histories of the engine: HISTOR
 mutation: setup ## small changes in arbiter/core that no core test notices: SAMPLE=300 SEED=n
 	$(TOOL) tests/mutation/mutation_run.py --sample $(SAMPLE) --seed $(SEED) $(ARGS)
 
+fuzz: setup ## bytes that break a parser of tests/fuzz/targets.py: MINUTES=10 TARGET=zmtp
+	$(TOOL) -m tests.fuzz.fuzz_run --minutes $(MINUTES) $(if $(TARGET),--target $(TARGET)) $(ARGS)
+
 measure: setup ## how long the path of a request is, and what one more request touches
 	$(TOOL) tests/measure_path.py
 	$(TOOL) tests/measure_request.py
@@ -107,6 +112,11 @@ schemas: setup ## write the JSON Schemas after a model changed
 
 docs: setup ## the documentation site in build/site; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+sbom: setup ## CycloneDX list of the packages of constraints.txt: out/sbom.cdx.json
+	mkdir -p out
+	$(BIN)/cyclonedx-py requirements --pyproject pyproject.toml --output-reproducible \
+		--output-file out/sbom.cdx.json constraints.txt
 
 wheel: setup ## dist/vram_arbiter-*.whl, the same bytes wherever it is built
 	$(BIN)/python -m hatchling build -t wheel
