@@ -7,8 +7,10 @@ GPU ?= fake:8GiB
 OUT ?= out/demo
 ARGS ?=
 QUICK ?=
-# Minutes of turns on each program of `make bench-gateway`.
+# Minutes of turns on each program of `make bench-gateway`, and of `make fuzz` altogether.
 MINUTES ?= 10
+# Of `make fuzz`: one parser alone.
+TARGET ?=
 # Seconds of `make chaos`.
 SECONDS ?= 300
 # Histories of `make nightly`, of all rule machines together; MACHINE: one of them alone.
@@ -28,8 +30,8 @@ WORKERS ?= 4
 BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-core setup-worlds setup-vllm jetson demo test test-core test-gpu nightly mutation measure lint format \
-	explore chaos sim bench bench-doors bench-gateway bench-switch schemas docs clean
+.PHONY: help setup setup-core setup-worlds setup-vllm jetson demo test test-core test-gpu nightly mutation fuzz measure lint format \
+	explore lock sbom wheel chaos sim bench bench-doors bench-gateway bench-switch schemas docs clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -74,6 +76,9 @@ explore: setup ## all orders of events of small worlds: MINUTES=60 WORLD=turns
 mutation: setup ## small changes in arbiter/core that no core test notices: SAMPLE=300 SEED=n EXPLORE=60
 	$(TOOL) tests/mutation/mutation_run.py --sample $(SAMPLE) --seed $(SEED) --explore $(EXPLORE) $(ARGS)
 
+fuzz: setup ## bytes that break a parser of tests/fuzz/targets.py: MINUTES=10 TARGET=zmtp
+	$(TOOL) -m tests.fuzz.fuzz_run --minutes $(MINUTES) $(if $(TARGET),--target $(TARGET)) $(ARGS)
+
 measure: setup ## how long the path of a request is, and what one more request touches
 	$(TOOL) tests/measure_path.py
 	$(TOOL) tests/measure_request.py
@@ -112,6 +117,17 @@ schemas: setup ## write the JSON Schemas after a model changed
 
 docs: setup ## the documentation site in build/site; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+lock: setup ## constraints-hashed.txt, as pyproject.toml asks: ARGS=--upgrade, or ARGS="-P numpy"
+	@bash .ci/lock $(ARGS)
+
+sbom: setup ## CycloneDX list of the packages of constraints-hashed.txt: out/sbom.cdx.json
+	mkdir -p out
+	$(BIN)/cyclonedx-py requirements --pyproject pyproject.toml --output-reproducible \
+		--output-file out/sbom.cdx.json constraints-hashed.txt
+
+wheel: setup ## dist/vram_arbiter-*.whl, the same bytes wherever it is built
+	$(BIN)/python -m hatchling build -t wheel
 
 clean: ## remove environments, caches and outputs
 	rm -rf .venv .venv-core .venv-worlds .venv-vllm build dist out .coverage

@@ -1,5 +1,7 @@
-"""Reference pages of JSON Schemas, of the arbiter's configuration, of errors and of metrics."""
+"""Reference pages of JSON Schemas, of the arbiter's configuration, of errors, of metrics, and of the
+findings of `vramctl doctor`."""
 
+import inspect
 import json
 import re
 from collections.abc import Iterator
@@ -7,6 +9,7 @@ from pathlib import Path
 
 import yaml
 
+from vram_arbiter.clients.cli.doctor import CHECKS
 from vram_arbiter.clients.observer import names as of_the_arbiter  # noqa: F401  it describes metrics
 from vram_arbiter.reasoner.llm import names as of_language_models  # noqa: F401  as above
 from vram_arbiter.schemas.errors import CODES, VramError
@@ -20,6 +23,13 @@ def schema_page(path: Path) -> str:
     """Return the page of one file of schemas/json."""
     schema: Schema = json.loads(path.read_text(encoding="utf-8"))
     return "\n\n".join([f"# {path.stem}.json", *_object(schema), *_definitions(schema)]) + "\n"
+
+
+def schema_list(folder: Path) -> str:
+    """Return links to the pages of the files of schemas/json."""
+    return "\n".join(
+        f"- [{path.name}](schemas/{path.stem}.md)" for path in sorted(folder.glob("*.json"))
+    )
 
 
 def _definitions(schema: Schema) -> Iterator[str]:
@@ -144,6 +154,17 @@ def errors() -> str:
         rows.append(
             f"| `{code}` | `{error.__name__}` | {_needs(error)} | {_cell(error.__doc__ or '')} |"
         )
+    return "\n".join(rows)
+
+
+def findings() -> str:
+    """Return the table of what `vramctl doctor` examines, with the codes of each check."""
+    rows = ["| sound | warnings, errors and notes |", "| --- | --- |"]
+    for name, check, _ in CHECKS:
+        source = inspect.getsource(inspect.getmodule(check) or check)
+        codes = re.findall(rf'(?:note|warning|error)\(\s*f?"({name}\.[^"]+)"', source)
+        found = ", ".join(f"`{code}`" for code in codes)
+        rows.append(f"| {_cell(check.__doc__ or '')} | {found} |")
     return "\n".join(rows)
 
 

@@ -28,6 +28,7 @@ ROOT_PAGES = {
     "CHANGELOG.md": "reference/changelog.md",
     "CONTRIBUTING.md": "explanation/contributing.md",
     "README.md": "explanation/readme.md",
+    "SECURITY.md": "explanation/security.md",
 }
 SCHEMAS = "schemas/json/"
 # Front matter of pages that the search leaves out: their names are explained on other pages, and
@@ -39,6 +40,8 @@ LANGUAGES = {".py": "python", ".pl": "perl", ".yaml": "yaml", ".json": "json", "
 GENERATED: Mapping[str, Callable[[], str]] = {
     "configuration": lambda: contracts.configuration((TREE / "configs/arbiter.yaml").read_text()),
     "errors": contracts.errors,
+    "findings": contracts.findings,
+    "schemas": lambda: contracts.schema_list(TREE / SCHEMAS),
     "metrics": contracts.metrics,
     **{name: partial(programs.page, name) for name in programs.parsers()},
 }

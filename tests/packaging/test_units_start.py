@@ -11,15 +11,17 @@ import re
 import shutil
 import signal
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.packaging.machine import PATIENCE_S, Machine, obstacle
+from tests.packaging.machine import PATH, PATIENCE_S, Machine, obstacle
+from tests.packaging.wheels import wheels_into
 from vram_arbiter.schemas.fakegpu import FOLDER_VARIABLE
 
 OBSTACLE = obstacle()
@@ -37,7 +39,7 @@ LOADER = "/etc/ld.so.conf.d/opt-python.conf"
 def steps(heading: str, page: str = "systemd.md") -> list[str]:
     """The commands of a section's first block, as root types them."""
     section = (HOW_TO / page).read_text(encoding="utf-8").split(f"\n## {heading}\n")[1]
-    block = section.split("```sh\n")[1].split("```")[0].replace("\\\n", "")
+    block = re.sub(r"\\\n *", "", section.split("```sh\n")[1].split("```")[0])
     return [line.replace("sudo ", "") for line in block.splitlines()]
 
 
@@ -67,10 +69,11 @@ def before(booted: Machine) -> set[str]:
 def machine(booted: Machine, before: set[str]) -> Machine:
     """Set up by the commands of docs/how-to/systemd.md: first without a GPU, where everything but
     the start succeeds, then again with a simulated one."""
-    install = steps("Install")
-    assert "-m venv" in install[0]  # these two are done: the environment is mounted
-    assert "pip install" in install[1]
-    command = ["bash", "-c", f"{install[2].partition('#')[0]} --yes 2>&1"]
+    whole, join = steps("Install")
+    venv, pip, install = whole.split(" && ")
+    assert "-m venv" in venv  # these two are done: the environment is mounted
+    assert "pip install" in pip
+    command = ["bash", "-c", f"{install.partition('#')[0]} --yes 2>&1"]
     booted.run("mv", LOADER, f"{LOADER}.off")  # the interpreter's own is hidden from units
     booted.run("ldconfig")
     said = booted.run(*command, code=1)
@@ -84,7 +87,7 @@ def machine(booted: Machine, before: set[str]) -> Machine:
     booted.write("/etc/vram-arbiter/arbiter.env", 'ARBITER_OPTIONS="--gpu fake:8GiB"\n')
     said = booted.run(*command)
     assert {line.split()[0] for line in said.splitlines()[1:]} == {"check", "same", "run"}
-    booted.run("env", "USER=daemon", "bash", "-c", install[3])
+    booted.run("env", "USER=daemon", "bash", "-c", join)
     return booted
 
 
@@ -404,6 +407,25 @@ def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
     machine.run("systemctl", "stop", sidecar, runner)
     assert machine.show(sidecar, "Result") == ["success"]
     assert machine.show(runner, "Result") == ["success"]
+
+
+@pytest.mark.nightly
+def test_one_line_installs_the_wheel_and_starts_the_arbiter() -> None:
+    """The line of the page, on a machine with Python, systemd and a folder of wheels for an
+    index."""
+    with (
+        tempfile.TemporaryDirectory(dir="/var/tmp") as folder,  # /tmp is hidden inside
+        closing(Machine()) as made,
+    ):
+        wheels_into(Path(folder))
+        made.run("umount", "/opt/vram-arbiter")  # the line makes it anew
+        made.write("/etc/vram-arbiter/arbiter.env", 'ARBITER_OPTIONS="--gpu fake:8GiB"\n')
+        line, _ = steps("Install")
+        where = (f"PATH=/opt/python/bin:{PATH}", f"PIP_FIND_LINKS={folder}", "PIP_NO_INDEX=1")
+        typed = ("env", "--chdir", folder, *where, "bash", "-c", line.partition("#")[0])
+        assert "Proceed? [y/N]" in made.run(*typed, stdin="y\n")
+        assert made.show(ARBITER, "ActiveState") == ["active"]
+        assert "Simulated GPU" in made.run("vramctl", "status", "--endpoint", ENDPOINT)
 
 
 def put_next_version(machine: Machine) -> None:

@@ -1,18 +1,16 @@
 """The wheel holds the product and its data: no test, no training code. It is built from what the
 images copy, and installed as they do."""
 
-import ensurepip
 import os
 import shlex
 import shutil
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
 import pytest
 
 from tests.packaging.test_containers import text_of
+from tests.packaging.wheels import built, pip
 from tests.support.paths import ROOT
 
 IMAGE = text_of("Containerfile")
@@ -34,11 +32,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def wheel(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("hatchling", reason="the dependency group `dev`")
-    folder = tmp_path_factory.mktemp("wheel")
-    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
-    subprocess.run(build, cwd=source, check=True, capture_output=True)
-    (made,) = folder.glob("*.whl")
-    return made
+    return built(source, tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +65,20 @@ def test_no_tests_and_no_training_code(names: list[str]) -> None:
     assert not odd
 
 
+def test_the_same_bytes_are_built_in_another_place_at_another_time(
+    source: Path, wheel: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "elsewhere"
+    shutil.copytree(source, other, symlinks=True)
+    for path in other.rglob("*"):
+        os.utime(path, (1e9, 1e9), follow_symlinks=False)
+        if not path.is_symlink():
+            path.chmod(path.stat().st_mode & 0o700)
+    made = built(other, tmp_path / "dist", TZ="Asia/Tokyo", PYTHONHASHSEED="1", LC_ALL="C")
+    assert made.name == wheel.name
+    assert made.read_bytes() == wheel.read_bytes()
+
+
 def test_an_image_builds_from_what_it_copies(source: Path, wheel: Path, tmp_path: Path) -> None:
     """Both images copy the same; the wheel is installed by pip's line, without an index."""
     assert text_of("Containerfile.sidecar").copies == IMAGE.copies
@@ -78,12 +86,8 @@ def test_an_image_builds_from_what_it_copies(source: Path, wheel: Path, tmp_path
     options = shlex.split(line.split("pip install ")[1])
     assert options[-1] == "/source"
     options = [word.replace("/source", str(source)) for word in options[:-1]]
-    (pip,) = (Path(ensurepip.__file__).parent / "_bundled").glob("pip-*.whl")
     offline = ["--no-index", "--no-deps", "--no-compile", "--target", str(tmp_path / "target")]
-    subprocess.run(
-        [sys.executable, f"{pip}/pip", "install", *options, *offline, str(wheel)],
-        check=True, capture_output=True, env={**os.environ, "PIP_ROOT_USER_ACTION": "ignore"},
-    )  # fmt: skip
+    pip("install", *options, *offline, str(wheel), PIP_ROOT_USER_ACTION="ignore")
     assert (tmp_path / "target/vram_arbiter/configs/containers/compose.yaml").exists()
     (entry_points,) = (tmp_path / "target").glob("*.dist-info/entry_points.txt")
     assert "vram-arbiter = vram_arbiter.arbiter" in entry_points.read_text()
