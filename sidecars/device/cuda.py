@@ -120,10 +120,7 @@ class CudaMemory(DeviceMemory):
 
         try:
             pynvml.nvmlInit()
-            uuid = str(self._torch.cuda.get_device_properties(self._index).uuid)
-            handle = pynvml.nvmlDeviceGetHandleByUUID(
-                uuid if uuid.startswith("GPU-") else f"GPU-{uuid}"
-            )
+            handle = pynvml.nvmlDeviceGetHandleByUUID(self._uuid())
             listed = {
                 process.pid: process.usedGpuMemory
                 for process in pynvml.nvmlDeviceGetComputeRunningProcesses(handle)
@@ -131,3 +128,12 @@ class CudaMemory(DeviceMemory):
         except (pynvml.NVMLError, AttributeError):
             return None
         return listed.get(os.getpid())
+
+    def _uuid(self) -> str:
+        """Return the UUID as NVML takes it. Torch gives it without a prefix, so that of a MIG
+        instance is taken from where it was granted."""
+        named = os.environ.get(cuda.VISIBLE, "")
+        if named.startswith("MIG-") and "," not in named:
+            return named
+        uuid = str(self._torch.cuda.get_device_properties(self._index).uuid)
+        return uuid if uuid.startswith("GPU-") else f"GPU-{uuid}"
