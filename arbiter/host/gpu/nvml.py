@@ -19,6 +19,7 @@ from vram_arbiter.arbiter.host.gpu.probe import GpuDevice, Reading
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
 from vram_arbiter.schemas.ids import GpuId
 from vram_arbiter.schemas.runtime.nvml import UNKNOWN_INSTANCE, Device, devices
+from vram_arbiter.schemas.wire.views import SensorsView
 
 _HINT = "install the NVIDIA driver, or start with --gpu fake:8GiB to simulate a GPU"
 
@@ -104,6 +105,25 @@ class NvmlProbe:
             raise
         self._failing.discard(gpu)
         return Reading(used, total, self.processes(gpu))
+
+    def sensors(self, gpu: GpuId) -> SensorsView:
+        """Instances of a GPU have none: temperature and power are the board's, and NVML measures
+        the utilization of whole GPUs alone."""
+        nvml, (handle, instance) = self._nvml, self._devices[gpu]
+        if instance is not None:
+            return SensorsView()
+
+        def told(call: Callable[[Any], float]) -> float | None:
+            try:
+                return call(handle)
+            except nvml.NVMLError:
+                return None
+
+        return SensorsView(
+            told(lambda gpu: nvml.nvmlDeviceGetUtilizationRates(gpu).gpu / 100),
+            told(lambda gpu: float(nvml.nvmlDeviceGetTemperature(gpu, nvml.NVML_TEMPERATURE_GPU))),
+            told(lambda gpu: nvml.nvmlDeviceGetPowerUsage(gpu) / 1000),  # milliwatts
+        )
 
     def memory_supported(self) -> bool:
         """False where the GPU has no memory of its own (GB10): NVML says NOT_SUPPORTED. Other

@@ -2,6 +2,7 @@
  *
  *   gpu UUID TOTAL RESERVED USED [mig]                         one line a GPU, in the driver's order
  *   instance GPU PLACE ID UUID TOTAL RESERVED USED             a GPU instance with one compute instance, of a GPU in MIG mode
+ *   sensors GPU PERCENT CELSIUS MILLIWATTS                     none without it
  *   late GPU BYTES UNTIL                                       BYTES more are used until UNTIL (CLOCK_MONOTONIC, seconds)
  *   process GPU compute|graphics PID BYTES|na [UNTIL [ID]]     listed until then (inf: for ever), on the GPU instance ID
  *   error CALL CODE                                            CALL: init count memory memory_v2 compute graphics mig
@@ -21,11 +22,12 @@
 enum { SUCCESS = 0, NOT_SUPPORTED = 3, NO_PERMISSION = 4, INSUFFICIENT_SIZE = 7, NOT_FOUND = 6, VERSION_MISMATCH = 25, UNKNOWN = 999 };
 
 typedef unsigned long long u64;
-typedef struct { char uuid[96]; u64 total, reserved, used; int mig; unsigned id; } Gpu; /* or an instance */
+typedef struct { char uuid[96]; u64 total, reserved, used; int mig; unsigned id, sensors[3]; int told; } Gpu; /* or an instance */
 typedef struct { int gpu, graphics; unsigned pid; u64 used; unsigned id; } Process;
 typedef struct { Gpu gpus[GPUS], places[GPUS][PLACES]; int n_gpus; Process processes[PROCESSES]; int n_processes; int error, hangs; } World;
 
 typedef struct { u64 total, free, used; } Memory;
+typedef struct { unsigned gpu, memory; } Utilization;
 typedef struct { unsigned version; u64 total, reserved, free, used; } MemoryV2;
 typedef struct { unsigned pid; u64 used; unsigned instance, compute_instance; } ProcessInfo;
 
@@ -53,6 +55,9 @@ static void look(const char *call, World *world) {
         } else if (sscanf(line, "instance %d %d %u %95s %llu %llu %llu", &index, &place, &gpu.id, gpu.uuid, &gpu.total,
                           &gpu.reserved, &gpu.used) == 7) {
             world->places[index][place] = gpu;
+        } else if (sscanf(line, "sensors %d %u %u %u", &index, &gpu.sensors[0], &gpu.sensors[1], &gpu.sensors[2]) == 4) {
+            memcpy(world->gpus[index].sensors, gpu.sensors, sizeof gpu.sensors);
+            world->gpus[index].told = 1;
         } else if (sscanf(line, "late %d %llu %lf", &index, &count, &until) == 3) {
             if (until > now()) world->gpus[index].used += count;
         } else if (sscanf(line, "process %d %95s %u %31s %lf %u", &process.gpu, word, &process.pid, bytes, &until,
@@ -177,6 +182,25 @@ int nvmlDeviceGetMemoryInfo_v2(void *handle, MemoryV2 *memory) {
     memory->free = gpu->total - gpu->reserved - gpu->used;
     return SUCCESS;
 }
+
+static int sensor(void *handle, int which, unsigned *value) {
+    World w;
+    int error = begin("sensors", &w);
+    Gpu *gpu = gpu_of(handle, &w);
+    *value = gpu->sensors[which];
+    return error ? error : gpu->told ? SUCCESS : NOT_SUPPORTED;
+}
+
+int nvmlDeviceGetUtilizationRates(void *handle, Utilization *rates) {
+    rates->memory = 0;
+    return sensor(handle, 0, &rates->gpu);
+}
+
+int nvmlDeviceGetTemperature(void *handle, unsigned sensor_type, unsigned *celsius) {
+    return sensor_type ? NOT_SUPPORTED : sensor(handle, 1, celsius);
+}
+
+int nvmlDeviceGetPowerUsage(void *handle, unsigned *milliwatts) { return sensor(handle, 2, milliwatts); }
 
 /* An instance lists what runs on any of its GPU, each with its instance, so that a reader has to look at that. */
 static int list(void *handle, const char *call, int graphics, unsigned *count, ProcessInfo *infos) {

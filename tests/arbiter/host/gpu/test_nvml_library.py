@@ -39,6 +39,12 @@ ALL = """
         for reading in [probe.sample(gpu.id)]
     ]))
 """
+SENSORS = """
+    from dataclasses import astuple
+    from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
+    probe = NvmlProbe()
+    print(json.dumps([astuple(probe.sensors(gpu.id)) for gpu in probe.gpus()]))
+"""
 PROGRAMS = """
     from vram_arbiter.clients.calibration.gpu import open_gpu
     from vram_arbiter.clients.cli.doctor.machine import ask_nvml
@@ -232,6 +238,16 @@ def test_an_instance_that_was_made_anew_is_unknown(nvml: NvmlStub) -> None:
     assert (said[0], said[3]) == (2, 5)
     assert said[1] == "MIG-a is gone, MIG-b is in its place"
     assert "no longer lists MIG-a" in said[2]
+
+
+def test_sensors_are_those_of_the_board(nvml: NvmlStub) -> None:
+    """A GPU without them is none the worse for it, and an instance is not its GPU."""
+    nvml.gpus += [f"gpu GPU-stub-1 {GIB} 0 0", f"gpu GPU-stub-2 {GIB} 0 0 mig"]
+    nvml.write(f"instance 2 0 1 MIG-1 {GIB} 0 0", "sensors 0 87 64 215400", "sensors 2 5 50 60000")
+    unknown = [None, None, None]
+    assert answer_of_child(nvml, SENSORS) == [[0.87, 64.0, 215.4], unknown, unknown]
+    nvml.write("sensors 0 87 64 215400", "error sensors 15")
+    assert answer_of_child(nvml, SENSORS) == [unknown, unknown]
 
 
 def test_programs_take_instances_for_gpus(nvml: NvmlStub) -> None:
