@@ -80,7 +80,7 @@ class GpuView:
     gpu: str
     index: int
     name: str
-    source: str  # what reads it: nvml, unified, fake
+    source: str  # what reads it: nvml, unified, drm, fake
     capacity_bytes: int
     reserve_bytes: int
     charged_bytes: int

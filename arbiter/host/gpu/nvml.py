@@ -21,7 +21,10 @@ from vram_arbiter.schemas.ids import GpuId
 from vram_arbiter.schemas.runtime.nvml import UNKNOWN_INSTANCE, Device, devices
 from vram_arbiter.schemas.wire.views import SensorsView
 
-_HINT = "install the NVIDIA driver, or start with --gpu fake:8GiB to simulate a GPU"
+_HINT = (
+    "install the NVIDIA driver, or start with --gpu drm for GPUs of AMD and Intel, or with --gpu "
+    "fake:8GiB to simulate one"
+)
 
 
 class NvmlProbe:

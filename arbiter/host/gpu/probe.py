@@ -16,6 +16,8 @@ What sources can tell beside the total. The engine derives it from each reading
 | NVML in a container, host's /proc hidden | no              | no          | no                |
 | unified: nvmap as root, or NVML's list   | yes             | yes         | yes               |
 | unified: neither                         | no              | no          | no                |
+| drm, every process may be looked at      | yes             | yes         | yes               |
+| drm, else                                | no              | no          | no                |
 | fake                                     | yes             | yes         | yes               |
 | fake with the fault `hide_processes`     | no              | no          | no                |
 

@@ -90,6 +90,9 @@ def test_run_leases_for_a_program(arbiter_daemon: ArbiterProcess) -> None:
         ("GPU-1", {"CUDA_VISIBLE_DEVICES": "0"}, {}),
         ("GPU-fake-1", {}, {}),
         ("UNIFIED-0", {}, {}),
+        ("AMD-c0ffee", {}, {"ROCR_VISIBLE_DEVICES": "GPU-c0ffee"}),
+        ("AMD-c0ffee", {"HIP_VISIBLE_DEVICES": "0"}, {}),
+        ("PCI-0000:03:00.0", {}, {}),
     ],
 )
 def test_cuda_sees_the_granted_gpu(
