@@ -23,3 +23,12 @@ def visible(gpu: str, environ: Mapping[str, str]) -> dict[str, str]:
     if VISIBLE in environ or not known:
         return {}
     return {VISIBLE: gpu, **({} if ORDER in environ else {ORDER: PCI})}
+
+
+def instance(environ: Mapping[str, str]) -> str | None:
+    """Return the MIG instance that CUDA is limited to; None: to none, or to one of several.
+
+    CUDA's own answer does not say whether its UUID is that of an instance or of a GPU.
+    """
+    named = environ.get(VISIBLE, "")
+    return named if named.startswith("MIG-") and "," not in named else None

@@ -120,7 +120,10 @@ class CudaMemory(DeviceMemory):
 
         try:
             pynvml.nvmlInit()
-            handle = pynvml.nvmlDeviceGetHandleByUUID(self._uuid())
+            uuid = str(self._torch.cuda.get_device_properties(self._index).uuid)
+            handle = pynvml.nvmlDeviceGetHandleByUUID(
+                cuda.instance(os.environ) or f"GPU-{uuid.removeprefix('GPU-')}"
+            )
             listed = {
                 process.pid: process.usedGpuMemory
                 for process in pynvml.nvmlDeviceGetComputeRunningProcesses(handle)
@@ -128,12 +131,3 @@ class CudaMemory(DeviceMemory):
         except (pynvml.NVMLError, AttributeError):
             return None
         return listed.get(os.getpid())
-
-    def _uuid(self) -> str:
-        """Return the UUID as NVML takes it. Torch gives it without a prefix, so that of a MIG
-        instance is taken from where it was granted."""
-        named = os.environ.get(cuda.VISIBLE, "")
-        if named.startswith("MIG-") and "," not in named:
-            return named
-        uuid = str(self._torch.cuda.get_device_properties(self._index).uuid)
-        return uuid if uuid.startswith("GPU-") else f"GPU-{uuid}"

@@ -102,6 +102,16 @@ def test_cuda_sees_the_granted_gpu(
     assert cuda.visible(gpu, environ) == variables
 
 
+@pytest.mark.parametrize(
+    ("named", "found"),
+    [("MIG-1", "MIG-1"), ("MIG-1,MIG-2", None), ("GPU-1", None), ("0", None), (None, None)],
+)
+def test_a_program_knows_the_instance_that_it_was_granted(
+    named: str | None, found: str | None
+) -> None:
+    assert cuda.instance({} if named is None else {"CUDA_VISIBLE_DEVICES": named}) == found
+
+
 @pytest.mark.e2e
 @pytest.mark.parametrize(
     ("command", "code", "said"),

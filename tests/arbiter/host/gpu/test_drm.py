@@ -10,8 +10,13 @@ from typing import Any
 
 import pytest
 
+from vram_arbiter.arbiter.core.arbiter import Arbiter
+from vram_arbiter.arbiter.core.events import MemorySampled
+from vram_arbiter.arbiter.core.settings import Settings
 from vram_arbiter.arbiter.host.gpu.drm import DrmProbe
 from vram_arbiter.arbiter.host.gpu.pids import PidMap
+from vram_arbiter.arbiter.settings import budget
+from vram_arbiter.schemas.config.arbiter import ArbiterConfig
 from vram_arbiter.schemas.defaults import GIB, KIB, MIB
 from vram_arbiter.schemas.errors import NoGpu, ProbeFailed, UnknownGpu
 from vram_arbiter.schemas.ids import GpuId
@@ -106,6 +111,20 @@ def test_a_process_has_the_bytes_of_its_clients_on_the_gpu(root: Path) -> None:
     listed = probe_of(root).sample(AMD).processes
     assert listed is not None
     assert listed[0].name == "llama-server -m"
+
+
+def test_a_process_without_a_lease_is_a_stowaway(root: Path) -> None:
+    opens(root, 7, 4, FIRST, 20, "drm-resident-vram:\t2048 MiB")
+    probe = probe_of(root)
+    engine = Arbiter(Settings(epoch=1, gpus=budget(probe.gpus(), ArbiterConfig(), "drm")), 0.0)
+    read = probe.sample(AMD)
+    sampled = MemorySampled(AMD, 1.0, read.used_bytes, read.total_bytes, read.processes)
+    engine.handle(sampled, 1.0)
+    gpu, _ = engine.status(1.0, None).gpus
+    assert (gpu.gpu, gpu.source, gpu.measured_used_bytes) == (AMD, "drm", 3 * GIB)
+    assert [(one.pid, one.name, one.used_bytes, one.stowaway) for one in gpu.processes] == [
+        (7, "llama-server -m", 2 * GIB, True)
+    ]
 
 
 def test_a_list_with_a_gap_is_no_list(root: Path) -> None:
