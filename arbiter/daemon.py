@@ -34,6 +34,7 @@ from vram_arbiter.arbiter.host.prober import Prober, within
 from vram_arbiter.arbiter.host.process import leave_no_zombies, memory_bytes, raise_limits
 from vram_arbiter.arbiter.host.process_watch import ProcessWatch
 from vram_arbiter.arbiter.host.records import record_of
+from vram_arbiter.arbiter.host.sensors import SensorReader
 from vram_arbiter.arbiter.inbox import Inbox, SuspendWatch
 from vram_arbiter.arbiter.log import log_event
 from vram_arbiter.arbiter.places import Places, find_places, take_folders
@@ -228,6 +229,8 @@ class Daemon:
             self._engine.claims,
         )
         undo.callback(prober.close)
+        sensors = SensorReader(probe, [gpu.id for gpu in self._gpus])
+        undo.callback(sensors.close)
         undo.callback(inbox.close)
         self._reload = Reload(self._config, self._source, inbox, self._history, self._say)
         self._watch = ProcessWatch(loop, start_ticks, self._process_died)
@@ -240,6 +243,8 @@ class Daemon:
             time.monotonic,
             self._problems,
             self._view,
+            sensors.ask,
+            sensors.known,
         )
         self._executor = Executor(
             self._sessions,

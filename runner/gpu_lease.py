@@ -10,10 +10,12 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import logging
+import os
 import uuid
 from collections.abc import AsyncIterator, Mapping
 
 from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.cuda import instance
 from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.wire.spec import Footprint
 
@@ -98,6 +100,8 @@ def _egl_cuda_ordinal(chosen: str) -> int | None:
 
 def cuda_uuid(ordinal: int) -> str | None:
     """Return the UUID of a CUDA device as NVML writes it; None without CUDA or such a device."""
+    if (named := instance(os.environ)) is not None:
+        return named
     try:
         cuda = ctypes.CDLL("libcuda.so.1")
     except OSError:

@@ -7,6 +7,8 @@ from functools import cache
 from opentelemetry import metrics
 from opentelemetry.metrics import CallbackOptions, Observation
 
+from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.nvml import devices
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry.names import INSTRUMENTS
 
@@ -41,12 +43,11 @@ def _gpu_memory(_: CallbackOptions) -> Iterable[Observation]:
 
     found = []
     try:
-        for index in range(pynvml.nvmlDeviceGetCount()):
-            handle = pynvml.nvmlDeviceGetHandleByIndex(index)
+        for handle, _ in devices(pynvml):
             if (held := _held(handle)) is not None:
                 labels = {telemetry.ATTR_GPU: pynvml.nvmlDeviceGetUUID(handle)}
                 found.append(Observation(held, labels))
-    except pynvml.NVMLError:  # the driver restarts, or the GPU fell off the bus
+    except (pynvml.NVMLError, ConfigError):  # the driver restarts, or the GPU fell off the bus
         pass
     return found
 

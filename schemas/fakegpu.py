@@ -35,6 +35,7 @@ from vram_arbiter.schemas.errors import ConfigError, OutOfMemory
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.plain import JsonMap, JsonObject
 from vram_arbiter.schemas.units import ByteSize, format_bytes
+from vram_arbiter.schemas.wire.views import SensorsView
 
 GPU_FILE = "gpu.json"
 LOG_FILE = "log.jsonl"
@@ -76,6 +77,7 @@ class FakeGpuConfig(_Frozen):
     release_lag_s: Lag = RELEASE_LAG_S
     throttle_bytes_per_s: Annotated[ByteSize, Field(gt=0)] | None = None
     boot_id: str = ""  # of the machine's boot that the process files belong to
+    sensors: SensorsView = SensorsView()
     faults: Faults = Faults()
 
 

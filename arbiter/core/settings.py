@@ -15,7 +15,7 @@ class GpuInfo:
     name: str
     capacity_bytes: int
     reserve_bytes: int = d.RESERVE_BYTES
-    source: str = ""  # what reads it: nvml, unified, fake
+    source: str = ""  # what reads it: nvml, unified, drm, fake
     noise_bytes: int = 0  # by how much its readings move when nothing happens
     total_bytes: int = 0  # what its readings call all of it; 0: not known before the first one
 

@@ -8,7 +8,7 @@ every limit's breach is a typed reply; no input raises.
 
 import difflib
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from vram_arbiter.arbiter.core import events as ev
@@ -35,7 +35,7 @@ from vram_arbiter.schemas.errors import (
     VersionMismatch,
     VramError,
 )
-from vram_arbiter.schemas.ids import ClientId, ProcessKey, RequestId
+from vram_arbiter.schemas.ids import ClientId, GpuId, ProcessKey, RequestId
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.peercred import Peer
 from vram_arbiter.schemas.runtime.zmtp import Oversize
@@ -52,7 +52,7 @@ from vram_arbiter.schemas.wire.replies import (
     WelcomeReply,
 )
 from vram_arbiter.schemas.wire.spec import LeaseSpec
-from vram_arbiter.schemas.wire.views import DaemonView, DemandView
+from vram_arbiter.schemas.wire.views import DaemonView, DemandView, SensorsView
 
 HISTORY_PAGE = 2000
 """Events in one reply, whatever was asked for: packing more would hold the loop for too long."""
@@ -99,6 +99,8 @@ class SessionTable:
         clock: Callable[[], float],
         problems: Callable[[], list[str]] = list,
         daemon: Callable[[], DaemonView | None] = lambda: None,
+        ask_sensors: Callable[[], None] = lambda: None,
+        sensors: Callable[[], Mapping[GpuId, SensorsView]] = dict,
     ) -> None:
         self._settings = settings
         self._epoch = settings.epoch
@@ -107,6 +109,8 @@ class SessionTable:
         self._clock = clock
         self._problems = problems
         self._daemon = daemon
+        self._ask_sensors = ask_sensors
+        self._sensors = sensors
         self.refused: Counter[str] = Counter()
         """Refused requests by code, since the start."""
         self._refusals = RefusalLog(clock)
@@ -298,6 +302,7 @@ class SessionTable:
                 self.reply(client, re, PingReply(self._settings.server))
             case w.Status():
                 reader = None if session.role == "operator" else session.peer.process
+                self._ask_sensors()
                 decisions.when_read(lambda: self._status(client, re, reader, request))
             case w.AskWhy(consumer=consumer):
                 decisions.when_read(lambda: self.reply(client, re, decisions.why(consumer)))
@@ -336,8 +341,17 @@ class SessionTable:
     ) -> None:
         status = self._decisions.status(reader, request.after, details=request.details)
         demands = () if request.after else tuple(view for _, view in self._demands())
-        problems, daemon = tuple(self._problems()), self._daemon()
-        self.reply(client, re, replace(status, problems=problems, daemon=daemon, demands=demands))
+        known = self._sensors()
+        told = replace(
+            status,
+            gpus=tuple(
+                replace(gpu, sensors=known.get(GpuId(gpu.gpu), gpu.sensors)) for gpu in status.gpus
+            ),
+            problems=tuple(self._problems()),
+            daemon=self._daemon(),
+            demands=demands,
+        )
+        self.reply(client, re, told)
 
     def _demands(self) -> Iterable[tuple[Session, DemandView]]:
         return ((one, view) for one in self._sessions.values() for view in one.demands)

@@ -13,6 +13,7 @@ from vram_arbiter.clients import cuda
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed
 from vram_arbiter.schemas.runtime.fakegpu_folder import locked, settled
+from vram_arbiter.schemas.runtime.nvml import devices
 
 _HINT = "install the NVIDIA driver, or use --device fake:FOLDER for a simulated GPU"
 
@@ -84,8 +85,8 @@ def fake_gpu(folder: Path) -> Gpu:
 
 
 def nvml_gpu(index: int, nvml: Any) -> Gpu:
-    """Open the NVIDIA GPU number `index`, in the order of NVML and of the PCI bus. `nvml` is the
-    module `pynvml`. Raises NoGpu."""
+    """Open the NVIDIA GPU or MIG instance number `index`, in the order of NVML and of the PCI bus.
+    `nvml` is the module `pynvml`. Raises NoGpu or ConfigError."""
 
     def read() -> Reading:
         try:
@@ -96,10 +97,10 @@ def nvml_gpu(index: int, nvml: Any) -> Gpu:
 
     try:
         nvml.nvmlInit()
-        handle = nvml.nvmlDeviceGetHandleByIndex(index)
+        handle = devices(nvml)[index].handle
         uuid, name = nvml.nvmlDeviceGetUUID(handle), nvml.nvmlDeviceGetName(handle)
         driver = nvml.nvmlSystemGetDriverVersion()
-    except nvml.NVMLError as error:
+    except (nvml.NVMLError, IndexError) as error:
         raise NoGpu(f"no NVIDIA driver answers for GPU {index}: {error}", hint=_HINT) from error
     return Gpu(uuid, name, driver, "cuda", {cuda.VISIBLE: uuid, cuda.ORDER: cuda.PCI}, read)
 

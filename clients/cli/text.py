@@ -114,6 +114,8 @@ def _gpu_lines(gpu: JsonMap) -> list[str]:
             f"  measured {size(gpu['measured_used_bytes'])} in use, "
             f"{duration(gpu['sample_age_s'] or 0.0)} ago"
         )
+    if sensors := sensors_text(gpu.get("sensors", {})):
+        lines.append(f"  {sensors}")
     if gpu["pressure_bytes"]:
         lines.append(f"  pressure: {size(gpu['pressure_bytes'])} more than was granted")
     if gpu["blocked"] is not None:
@@ -126,6 +128,19 @@ def _gpu_lines(gpu: JsonMap) -> list[str]:
         elif process.get("residue_bytes"):
             lines.append(f"  residue of {who}: {size(process['residue_bytes'])}")
     return lines
+
+
+def sensors_text(sensors: JsonMap) -> str:
+    """Return `87 % busy, 64 °C, 215 W`, without what is unknown."""
+    told = (
+        f"{figure * factor:.0f} {unit}"
+        for key, factor, unit in _SENSORS
+        if (figure := sensors.get(key)) is not None
+    )
+    return ", ".join(told)
+
+
+_SENSORS = (("utilization", 100, "% busy"), ("temperature_c", 1, "°C"), ("power_w", 1, "W"))
 
 
 def _lease_row(lease: JsonMap, indices: Mapping[str, str]) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from vram_arbiter.schemas.runtime.telemetry import names
 from vram_arbiter.schemas.runtime.telemetry.meters import new_counter, new_histogram
 from vram_arbiter.schemas.runtime.telemetry.names import INSTRUMENTS
 from vram_arbiter.schemas.wire.replies import StatusReply
-from vram_arbiter.schemas.wire.views import DaemonView, GpuView
+from vram_arbiter.schemas.wire.views import DaemonView, GpuView, SensorsView
 
 STATUS_MAX_AGE_S = 40.0
 """An arbiter that was not heard for so long may be anything: a gap in the curve, not a straight
@@ -89,6 +89,9 @@ class LeaseMetrics:
         yield own.METRIC_PRESSURE, _by_gpu(lambda gpu: gpu.pressure_bytes)
         yield own.METRIC_READABLE, _by_gpu(lambda gpu: int(gpu.measured_used_bytes is not None))
         yield own.METRIC_READING_AGE, _by_gpu(self._age_s)
+        yield own.METRIC_UTILIZATION, _sensor(lambda known: known.utilization)
+        yield own.METRIC_TEMPERATURE, _sensor(lambda known: known.temperature_c)
+        yield own.METRIC_POWER, _sensor(lambda known: known.power_w)
         yield own.METRIC_DRAINED, _one(lambda seen: bool(seen.drained))
         yield own.METRIC_JOURNAL_HEALTHY, _daemon(lambda daemon: daemon.journal_healthy)
         yield own.METRIC_JOURNAL_DOUBTED, _daemon(lambda daemon: daemon.journal_doubted)
@@ -203,6 +206,16 @@ def _by_gpu(figure: Callable[[GpuView], float | None]) -> _Read:
         for gpu in seen.gpus:
             if (count := figure(gpu)) is not None:
                 yield Observation(count, {names.ATTR_GPU: gpu.gpu})
+
+    return read
+
+
+def _sensor(figure: Callable[[SensorsView], float | None]) -> _Read:
+    def read(seen: StatusReply) -> Iterable[Observation]:
+        for gpu in seen.gpus:
+            if (value := figure(gpu.sensors)) is not None:
+                labels = {own.ATTR_HARDWARE_ID: gpu.gpu, own.ATTR_HARDWARE: own.HARDWARE_GPU}
+                yield Observation(value, labels)
 
     return read
 

@@ -20,6 +20,8 @@ ATTR_VERDICT = "vram.verdict"
 ATTR_BYTES_BEFORE = "vram.bytes_before"  # spans only: the whole GPU when the unloading began
 ATTR_BYTES_AFTER = "vram.bytes_after"  # spans only: and at the verdict
 ATTR_WANTED_BY = "vram.wanted_by"  # spans only: the consumer that needs the room
+ATTR_HARDWARE, HARDWARE_GPU = "hw.type", "gpu"  # of OpenTelemetry's `hw.*`, as is the next
+ATTR_HARDWARE_ID = "hw.id"  # the GPU's
 ATTR_VERSION = "version"
 ATTR_PYTHON = "python"
 
@@ -71,6 +73,11 @@ METRIC_READING_AGE = metric(
     "s",
     "Since the newest successful reading; an idle arbiter reads rarely",
 )
+METRIC_UTILIZATION = metric(
+    "hw.gpu.utilization", "1", "Share of the last moments in which the GPU was busy"
+)
+METRIC_TEMPERATURE = metric("hw.temperature", "Cel", "Temperature of the GPU")
+METRIC_POWER = metric("hw.power", "W", "Power of the GPU's board")
 METRIC_DRAINED = metric(
     "vram_arbiter.drained", "", "1 while an operator's drain stops grants, else 0"
 )

@@ -29,9 +29,9 @@ class GpuConfig(_Section):
     """Which GPUs are leased and how much of each."""
 
     source: str = "auto"
-    """`auto`: `nvml` or `unified`, by what this machine is. `nvml`: its NVIDIA GPUs. `unified`:
-    the memory that CPU and GPU share on a Jetson or a GB10. `fake:8GiB`: one simulated GPU.
-    `fake:FOLDER`: the GPU in that folder.
+    """`auto`: `nvml` or `unified`, by what this machine is. `nvml`: its NVIDIA GPUs and MIG
+    instances. `unified`: the memory that CPU and GPU share on a Jetson or a GB10. `drm`: its AMD
+    and Intel GPUs. `fake:8GiB`: one simulated GPU. `fake:FOLDER`: the GPU in that folder.
     """
     reserve_bytes: ByteSize = d.RESERVE_BYTES
     """Bytes of every GPU that are never leased: driver, display, allocator slack. At least 15 % of
@@ -50,11 +50,11 @@ class GpuConfig(_Section):
     @field_validator("source")
     @classmethod
     def _known_source(cls, value: str) -> str:
-        if value not in ("auto", "nvml", "unified") and not (
+        if value not in ("auto", "nvml", "unified", "drm") and not (
             value.startswith("fake:") and len(value) > 5
         ):
             raise ValueError(
-                f"{value!r} is not a source of GPUs; write auto, nvml, unified, fake:8GiB or "
+                f"{value!r} is not a source of GPUs; write auto, nvml, unified, drm, fake:8GiB or "
                 "fake:FOLDER"
             )
         sizes = (

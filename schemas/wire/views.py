@@ -65,13 +65,22 @@ class ProcessView:
 
 
 @dataclass(frozen=True, slots=True)
+class SensorsView:
+    """What a GPU tells beside its memory; None: unknown. No decision depends on it."""
+
+    utilization: float | None = None  # share of the last moments in which the GPU was busy
+    temperature_c: float | None = None
+    power_w: float | None = None  # of the whole board
+
+
+@dataclass(frozen=True, slots=True)
 class GpuView:
     """A GPU: what is charged, what is measured, and why nothing is granted now."""
 
     gpu: str
     index: int
     name: str
-    source: str  # what reads it: nvml, unified, fake
+    source: str  # what reads it: nvml, unified, drm, fake
     capacity_bytes: int
     reserve_bytes: int
     charged_bytes: int
@@ -81,6 +90,7 @@ class GpuView:
     pressure_bytes: int
     blocked: BlockView | None  # None: grants are possible
     processes: tuple[ProcessView, ...]
+    sensors: SensorsView = SensorsView()  # of the last 20 s
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from typing import Any
 from vram_arbiter.clients import cuda
 from vram_arbiter.schemas.errors import NoGpu
 from vram_arbiter.schemas.fakegpu import GPU_FILE, FakeGpuConfig, parse_config
+from vram_arbiter.schemas.runtime.nvml import devices
 
 FAKE = "fake:"
 
@@ -97,15 +98,15 @@ def visible(device: str, environ: Mapping[str, str], nvml: Any) -> list[Any]:
     """Return the handles of the GPUs that `cuda` or `cuda:N` may mean, of an initialized `nvml`."""
     named = environ.get(cuda.VISIBLE)
     if named is None:
-        words = [str(index) for index in range(nvml.nvmlDeviceGetCount())]
+        found = [one.handle for one in devices(nvml)]
     else:
         words = [word.strip() for word in named.split(",") if word.strip()]
-    found = [
-        nvml.nvmlDeviceGetHandleByIndex(int(word))
-        if word.isdecimal()
-        else nvml.nvmlDeviceGetHandleByUUID(word)
-        for word in words
-    ]
+        found = [
+            nvml.nvmlDeviceGetHandleByIndex(int(word))
+            if word.isdecimal()
+            else nvml.nvmlDeviceGetHandleByUUID(word)
+            for word in words
+        ]
     number = device.partition(":")[2]
     return found[int(number) : int(number) + 1] if number else found
 

@@ -122,7 +122,7 @@ class CudaMemory(DeviceMemory):
             pynvml.nvmlInit()
             uuid = str(self._torch.cuda.get_device_properties(self._index).uuid)
             handle = pynvml.nvmlDeviceGetHandleByUUID(
-                uuid if uuid.startswith("GPU-") else f"GPU-{uuid}"
+                cuda.instance(os.environ) or f"GPU-{uuid.removeprefix('GPU-')}"
             )
             listed = {
                 process.pid: process.usedGpuMemory

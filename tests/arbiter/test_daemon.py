@@ -57,7 +57,7 @@ def test_a_typo_in_the_configuration_is_named_with_its_line(make_arbiter: Make) 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--gpu", "cuda"], "write auto, nvml, unified, fake:8GiB"),
+        (["--gpu", "cuda"], "write auto, nvml, unified, drm, fake:8GiB"),
         (["--gpu", "fake:lots"], "not a size"),
         (["--gpu", "fake:100MiB"], "leaves nothing of"),
         (["--gpu", "fake:0"], "a GPU without memory"),

@@ -206,8 +206,11 @@ def test_other_processes_stay_visible_and_the_gpus_reachable() -> None:
     assert found["Service", "PrivateDevices"] == ["no"]
     assert "char-nvidia* rw" in found["Service", "DeviceAllow"]
     assert "AF_UNIX" in found["Service", "RestrictAddressFamilies"][0]
-    kill = settings_of((SOURCES / "system/vram-arbiter.service.d/kill.conf.example").read_text())
-    assert kill["Service", "AmbientCapabilities"] == ["CAP_KILL"]
+    for name, needed in (("kill", "CAP_KILL"), ("drm", "CAP_PERFMON CAP_SYS_PTRACE")):
+        example = SOURCES / f"system/vram-arbiter.service.d/{name}.conf.example"
+        added = settings_of(example.read_text())
+        assert added["Service", "AmbientCapabilities"] == [needed]
+        assert added["Service", "CapabilityBoundingSet"] == [needed]
     assert found["Service", "AmbientCapabilities"] == [""], (
         "opt-in means that it is not there by itself"
     )

@@ -321,6 +321,9 @@ class Nvml:
     def nvmlDeviceGetCount(self) -> int:
         return 2
 
+    def nvmlDeviceGetMigMode(self, handle: str) -> list[int]:
+        return [0, 0]
+
     def nvmlDeviceGetHandleByIndex(self, index: int) -> str:
         return self.nvmlDeviceGetHandleByUUID(f"GPU-{index}")
 

@@ -15,7 +15,7 @@ class NotSupported(NVMLError):
 
 
 class NvmlModule:
-    """`NvmlModule(a_gpu(), a_gpu(uuid="GPU-2", index=1))`; `init_error` is what `nvmlInit` raises.
+    """`NvmlModule(a_gpu(), a_gpu(uuid="GPU-2"))`; `init_error` is what `nvmlInit` raises.
 
     An exception under `memory_error` is raised where the memory is asked for."""
 
@@ -44,9 +44,6 @@ class NvmlModule:
 
     def nvmlDeviceGetHandleByIndex(self, index: int) -> dict[str, Any]:
         return self.gpus[index]
-
-    def nvmlDeviceGetIndex(self, handle: dict[str, Any]) -> int:
-        return int(handle["index"])
 
     def nvmlDeviceGetUUID(self, handle: dict[str, Any]) -> str:
         return str(handle["uuid"])
@@ -77,7 +74,6 @@ def a_gpu(**changes: Any) -> dict[str, Any]:
     """A GPU of 8 GiB, of which 1 GiB is in use and the driver keeps a quarter."""
     return {
         "uuid": "GPU-1",
-        "index": 0,
         "name": "NVIDIA GPU",
         "total": 8 * GIB,
         "reserved": GIB // 4,

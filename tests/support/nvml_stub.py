@@ -31,3 +31,11 @@ class NvmlStub:
     def gpu(self, used: int, *, more: str = "") -> None:
         """One GPU of 8 GiB, of which the driver keeps 256 MiB."""
         self.gpus = [f"gpu GPU-stub-0 {8 * GIB} {256 * MIB} {used} {more}".rstrip()]
+
+    def instances(self, *used: int) -> None:
+        """One GPU in MIG mode, with instances 1, 2, … of 4 GiB, of which the driver keeps 64 MiB,
+        in every second place of the driver."""
+        self.gpus = [f"gpu GPU-stub-0 {8 * GIB} {256 * MIB} 0 mig"] + [
+            f"instance 0 {2 * place} {place + 1} MIG-stub-{place + 1} {4 * GIB} {64 * MIB} {bytes_}"
+            for place, bytes_ in enumerate(used)
+        ]

@@ -19,6 +19,7 @@ from vram_arbiter.schemas.ids import GpuId
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.runtime.fakegpu_folder import locked, replace, settled
 from vram_arbiter.schemas.units import parse_bytes
+from vram_arbiter.schemas.wire.views import SensorsView
 
 _HANG_POLL_S = 0.05  # how soon a simulated hang notices that it was switched off
 
@@ -69,6 +70,13 @@ class FakeProbe:
                 if process.own_bytes and process.died_at_s is None
             )
         return Reading(state.used_bytes, state.config.capacity_bytes, processes)
+
+    def sensors(self, gpu: GpuId) -> SensorsView:
+        try:
+            text = (self._folders[gpu] / fakegpu.GPU_FILE).read_text()
+            return fakegpu.parse_config(text).sensors
+        except (ConfigError, OSError, UnicodeDecodeError):
+            return SensorsView()
 
     def close(self) -> None:
         self._closed.set()

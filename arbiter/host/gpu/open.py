@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from vram_arbiter.arbiter.host.gpu.drm import DrmProbe
 from vram_arbiter.arbiter.host.gpu.fake import open_gpus
 from vram_arbiter.arbiter.host.gpu.pids import PidMap
 from vram_arbiter.arbiter.host.gpu.probe import GpuProbe
@@ -19,4 +20,6 @@ def open_probe(config: GpuConfig, runtime: Path) -> tuple[GpuProbe, str]:
         return open_gpus(what, runtime), "fake"
     host_proc = None if config.host_proc is None else Path(config.host_proc)
     pids = PidMap(config.pids, host_proc)
+    if kind == "drm":
+        return DrmProbe(pids), "drm"
     return choose("nvml" if kind == "nvml" else "unified" if kind == "unified" else "auto", pids)

@@ -51,6 +51,11 @@ class PidMap:
         """False: the driver's pids mean nothing here, so its lists are no evidence."""
         return self._own or self._host_proc is not None
 
+    @property
+    def listed_in(self) -> Path:
+        """The /proc that shows the processes by the driver's pids; only where something `knows`."""
+        return self._proc if self._own or self._host_proc is None else self._host_proc
+
     def translate(self, pid: int) -> tuple[ProcessKey, str]:
         """(process, name). A process of another namespace gets its host's pid, negative, so that it
         is never taken for one of ours."""

@@ -10,10 +10,14 @@ What sources can tell beside the total. The engine derives it from each reading
 | ---------------------------------------- | --------------- | ----------- | ----------------- |
 | NVML on a host                           | yes             | yes         | yes               |
 | NVML under WSL2                          | yes             | no          | yes               |
+| NVML, MIG: instances of processes told   | yes             | yes         | yes               |
+| NVML, MIG: else                          | no              | no          | no                |
 | NVML in a container, host's /proc known  | yes             | yes         | in this container |
 | NVML in a container, host's /proc hidden | no              | no          | no                |
 | unified: nvmap as root, or NVML's list   | yes             | yes         | yes               |
 | unified: neither                         | no              | no          | no                |
+| drm, every process may be looked at      | yes             | yes         | yes               |
+| drm, else                                | no              | no          | no                |
 | fake                                     | yes             | yes         | yes               |
 | fake with the fault `hide_processes`     | no              | no          | no                |
 
@@ -25,6 +29,7 @@ from typing import Protocol
 
 from vram_arbiter.arbiter.core.events import ProcessUse
 from vram_arbiter.schemas.ids import GpuId
+from vram_arbiter.schemas.wire.views import SensorsView
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +64,15 @@ class GpuProbe(Protocol):
     """A backend. Every method blocks.
 
     `gpus` raises NoGpu where there is none. `sample` raises ProbeFailed when the reading fails
-    (unknown, never free) and UnknownGpu for a GPU that `gpus` does not list. `close` may be called
-    from another thread and ends a hanging `sample` where the backend can.
+    (unknown, never free) and UnknownGpu for a GPU that `gpus` does not list. `sensors` leaves out
+    what cannot be read; it and `close` may be called from other threads. `close` ends a hanging
+    `sample` where the backend can.
     """
 
     def gpus(self) -> tuple[GpuDevice, ...]: ...
 
     def sample(self, gpu: GpuId) -> Reading: ...
+
+    def sensors(self, gpu: GpuId) -> SensorsView: ...
 
     def close(self) -> None: ...

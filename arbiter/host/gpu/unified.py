@@ -10,6 +10,7 @@ only), NVML's on Thor and GB10.
 
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +21,7 @@ from vram_arbiter.arbiter.host.gpu.probe import GpuDevice, GpuProbe, Reading
 from vram_arbiter.schemas.defaults import GIB, KIB, MIB
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
 from vram_arbiter.schemas.ids import GpuId
+from vram_arbiter.schemas.wire.views import SensorsView
 
 MARGIN_SHARE = 0.15
 """Of the machine's memory that is never leased: kernel, desktop, cameras and their growth. A
@@ -37,14 +39,22 @@ class UnifiedProbe:
     """`GpuProbe` with one GPU: the memory of the machine.
 
     `root` is where /proc, /sys and /etc are looked for; `evidence` lists bytes per process; None
-    where that is impossible.
+    where that is impossible. `sensors` tells what NVML does.
     """
 
-    def __init__(self, gpu: GpuId, name: str, root: Path, evidence: Evidence) -> None:
+    def __init__(
+        self,
+        gpu: GpuId,
+        name: str,
+        root: Path,
+        evidence: Evidence,
+        sensors: Callable[[], SensorsView] = SensorsView,
+    ) -> None:
         self._gpu = gpu
         self._name = name
         self._root = root
         self._evidence = evidence
+        self._sensors = sensors
 
     def gpus(self) -> tuple[GpuDevice, ...]:
         total, _ = read_meminfo(self._root)
@@ -60,6 +70,9 @@ class UnifiedProbe:
             raise UnknownGpu(f"no GPU {gpu}", details={"known": [self._gpu]})
         total, available = read_meminfo(self._root)
         return Reading(total - available, total, self._evidence())
+
+    def sensors(self, gpu: GpuId) -> SensorsView:
+        return self._sensors()
 
     def close(self) -> None:
         """Nothing is held open."""
@@ -156,7 +169,8 @@ def choose(
                 hint="write gpu.source: auto",
             )
         gpu, name = probe.first()
-        return UnifiedProbe(gpu, name, root, lambda: probe.processes(gpu)), "unified"
+        lists, sensors = partial(probe.processes, gpu), partial(probe.sensors, gpu)
+        return UnifiedProbe(gpu, name, root, lists, sensors), "unified"
     if source == "unified":
         probe.close()
         raise ConfigError(

@@ -18,6 +18,7 @@ from vram_arbiter.clients.cli.doctor.machine import Machine
 VERSION: Final = "/proc/driver/nvidia/version"
 PARAMS: Final = "/proc/driver/nvidia/params"
 NVIDIA: Final = "0x10de"
+CARDS: Final = "/sys/class/drm"
 SLEEP_UNITS: Final = ("nvidia-suspend.service", "nvidia-resume.service", "nvidia-hibernate.service")
 NODES: Final = ("/dev/nvidiactl", "/dev/nvidia0", "/dev/nvidia-uvm")
 UNITS: Final = "/etc/systemd/system"
@@ -44,6 +45,9 @@ def driver(m: Machine) -> Iterator[Finding]:
         held = f", the driver {bound} has it" if bound else ""
         what = f"there is an NVIDIA GPU and the module nvidia is not loaded{held}"
         yield error("driver.not-loaded", what, f"{m.sudo}modprobe nvidia")
+    elif others := [name for name in m.names(CARDS) if _is_read_by_drm(m, name)]:
+        what = f"no NVIDIA GPU; {len(others)} of AMD or Intel, which the source drm reads"
+        yield note("driver.other", what, "vram-arbiter --gpu drm")
     else:
         what = f"no NVIDIA GPU and no driver ({nvml.problem}); use a simulated GPU"
         yield note("driver.none", what, "vram-arbiter --gpu fake:8GiB")
@@ -110,3 +114,8 @@ def _gpu_without_driver(m: Machine) -> str | None:
             bound = m.path(f"{device}/driver")
             return os.path.basename(os.readlink(bound)) if bound.is_symlink() else ""
     return None
+
+
+def _is_read_by_drm(m: Machine, card: str) -> bool:
+    uevent = m.text(f"{CARDS}/{card}/device/uevent") or ""
+    return card.startswith("card") and bool({"DRIVER=amdgpu", "DRIVER=xe"} & {*uevent.split()})

@@ -19,6 +19,7 @@ from vram_arbiter.clients.net import request
 from vram_arbiter.schemas.codec import CodecError, from_map
 from vram_arbiter.schemas.errors import ConfigError, VramError
 from vram_arbiter.schemas.runtime.endpoints import SYSTEM_RUNTIME, socket_path
+from vram_arbiter.schemas.runtime.nvml import devices
 from vram_arbiter.schemas.runtime.peercred import credentials
 from vram_arbiter.schemas.runtime.version import version
 from vram_arbiter.schemas.wire.errors import ErrorView
@@ -34,7 +35,7 @@ class Nvml:
     """What NVML says. `problem`: why it does not work, under the name of its error class."""
 
     version: str = ""
-    gpus: int = 0
+    gpus: int = 0  # MIG instances too
     without_memory: bool = False  # Jetson and GB10: their memory is the machine's
     problem: str = ""
     error: str = ""
@@ -214,17 +215,17 @@ def ask_nvml() -> Nvml:
         return Nvml(problem=str(error), error=type(error).__name__)
     try:
         version = pynvml.nvmlSystemGetDriverVersion()
-        gpus = int(pynvml.nvmlDeviceGetCount())
-        for index in range(gpus):
+        gpus = devices(pynvml)
+        for gpu in gpus:
             try:
-                pynvml.nvmlDeviceGetMemoryInfo(pynvml.nvmlDeviceGetHandleByIndex(index))
+                pynvml.nvmlDeviceGetMemoryInfo(gpu.handle)
             except pynvml.NVMLError_NotSupported:
-                return Nvml(version, gpus, without_memory=True)
-    except pynvml.NVMLError as error:
+                return Nvml(version, len(gpus), without_memory=True)
+    except (pynvml.NVMLError, ConfigError) as error:
         return Nvml(problem=str(error), error=type(error).__name__)
     finally:
         pynvml.nvmlShutdown()
-    return Nvml(version, gpus)
+    return Nvml(version, len(gpus))
 
 
 def unix_sockets(machine: Machine) -> Mapping[str, bool]:

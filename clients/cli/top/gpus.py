@@ -107,7 +107,8 @@ def gpu_lines(gpu: GpuView, samples: Samples, width: int, *, brief: bool) -> lis
         ]
         parts += [f"stowaways {size(gpu.stowaway_bytes)}"] if gpu.stowaway_bytes else []
         parts += [f"pressure {size(gpu.pressure_bytes)}"] if gpu.pressure_bytes else []
-        told = " · ".join(parts)
+        known = text.sensors_text(to_map(gpu.sensors))
+        told = " · ".join([*parts, known] if known else parts)
         room = width - len(told) - 3
         if 0 < len(why) <= room:
             told, why = f"{told} · {why}", ""

@@ -17,6 +17,7 @@ from vram_arbiter.arbiter.host.prober import Prober, within
 from vram_arbiter.arbiter.host.process_tree import read_kin
 from vram_arbiter.schemas.errors import NoGpu, ProbeFailed
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
+from vram_arbiter.schemas.wire.views import SensorsView
 
 GPU = GpuId("GPU-1")
 
@@ -41,6 +42,9 @@ class ScriptedProbe:
         if isinstance(answer, Exception):
             raise answer
         return answer
+
+    def sensors(self, gpu: GpuId) -> SensorsView:
+        return SensorsView()
 
     def close(self) -> None:
         self.closed.set()

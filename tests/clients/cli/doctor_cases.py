@@ -171,6 +171,12 @@ CASES = [
         NOT_FOUND,
     ),
     Case("driver.none", "fake:8GiB", GONE, NOT_FOUND),
+    Case(
+        "driver.other",
+        "--gpu drm",
+        {**GONE, "/sys/class/drm/card0/device/uevent": "DRIVER=amdgpu\nPCI_CLASS=30000\n"},
+        NOT_FOUND,
+    ),
     Case("devices.missing", "nvidia-modprobe", {"/dev/nvidia-uvm": None}),
     Case("devices.closed", "usermod --append --groups", change=mode("/dev/nvidia0", 0o600)),
     Case(

@@ -126,6 +126,8 @@ def nvml(**changes: Any) -> Any:
     functions: dict[str, Any] = {
         "NVMLError": NvmlFault,
         "nvmlInit": lambda: None,
+        "nvmlDeviceGetCount": lambda: 1,
+        "nvmlDeviceGetMigMode": lambda handle: [0, 0],
         "nvmlDeviceGetHandleByIndex": lambda index: index,
         "nvmlDeviceGetUUID": lambda handle: "GPU-1",
         "nvmlDeviceGetName": lambda handle: "Test GPU",
@@ -152,6 +154,8 @@ def test_a_reading_of_nvml() -> None:
         assert nvml_gpu(0, unlisted).read() == Reading(5, None)
     with pytest.raises(NoGpu, match="library missing"):
         nvml_gpu(0, nvml(nvmlInit=lambda: fails(NvmlFault("library missing"))))
+    with pytest.raises(NoGpu, match="GPU 1"):
+        nvml_gpu(1, nvml())
 
 
 def test_devices_by_name(tmp_path: Path) -> None:

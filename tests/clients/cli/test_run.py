@@ -90,6 +90,9 @@ def test_run_leases_for_a_program(arbiter_daemon: ArbiterProcess) -> None:
         ("GPU-1", {"CUDA_VISIBLE_DEVICES": "0"}, {}),
         ("GPU-fake-1", {}, {}),
         ("UNIFIED-0", {}, {}),
+        ("AMD-c0ffee", {}, {"ROCR_VISIBLE_DEVICES": "GPU-c0ffee"}),
+        ("AMD-c0ffee", {"HIP_VISIBLE_DEVICES": "0"}, {}),
+        ("PCI-0000:03:00.0", {}, {}),
     ],
 )
 def test_cuda_sees_the_granted_gpu(
@@ -97,6 +100,16 @@ def test_cuda_sees_the_granted_gpu(
 ) -> None:
     """A program on a machine with two GPUs took the first, whichever was granted."""
     assert cuda.visible(gpu, environ) == variables
+
+
+@pytest.mark.parametrize(
+    ("named", "found"),
+    [("MIG-1", "MIG-1"), ("MIG-1,MIG-2", None), ("GPU-1", None), ("0", None), (None, None)],
+)
+def test_a_program_knows_the_instance_that_it_was_granted(
+    named: str | None, found: str | None
+) -> None:
+    assert cuda.instance({} if named is None else {"CUDA_VISIBLE_DEVICES": named}) == found
 
 
 @pytest.mark.e2e

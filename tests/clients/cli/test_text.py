@@ -89,6 +89,14 @@ def test_status() -> None:
     ]
 
 
+def test_status_shows_the_sensors_that_are_known() -> None:
+    """On a line of their own, and none where nothing is known."""
+    sensors = {"utilization": 0.873, "temperature_c": 64.0, "power_w": 215.4}
+    shown = text.status_lines(STATUS | {"gpus": [GPU | {"sensors": sensors}]})
+    assert shown[5] == "  87 % busy, 64 °C, 215 W"
+    assert text.sensors_text({"temperature_c": 0.0}) == "0 °C"
+
+
 def test_status_counts_requests_at_consumers_with_and_without_a_lease() -> None:
     demands = [
         {"consumer": "detector", "in_flight": 3, "waiting": 0, "client": "vram-gateway"},

@@ -39,7 +39,7 @@ from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.requests import Acquire
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
-from vram_arbiter.schemas.wire.views import DemandView
+from vram_arbiter.schemas.wire.views import DemandView, GpuView, SensorsView
 
 STRANGER = 65534
 HOSTILE = "x\x1b[2J\u202e\r\n名前" * 20
@@ -313,6 +313,13 @@ def test_columns_fit_and_obey_no_name(told_lines: StatusReply, width: int) -> No
     assert not [letter for letter in said if unicodedata.category(letter) in ("Cc", "Cf")]
     for order in ORDERS:
         assert len(sorted(rows, key=ORDERS[order])) == len(rows)
+
+
+def test_a_gpu_of_two_lines_shows_its_sensors() -> None:
+    gpu = GpuView("GPU-1", 0, "RTX", "nvml", 8 * GIB, 0, 0, 0, 0, 0.1, 0, None, ())
+    known = replace(gpu, sensors=SensorsView(0.87, 64.0))
+    told, _ = gpus.gpu_lines(known, Samples(), 80, brief=False)
+    assert told == "GPU 0 · charged 0 of 8.00 GiB · measured 0 · 87 % busy, 64 °C · RTX"
 
 
 def test_a_sparkline_shows_the_largest_reading_of_each_interval() -> None:

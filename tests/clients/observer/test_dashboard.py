@@ -236,8 +236,10 @@ def test_names_and_units_follow_the_conventions(pages: Pages) -> None:
     for name in promql.metrics_of(after, "vram_"):
         assert re.fullmatch(r"vram_arbiter(_[a-z]+)+", name), name
     for name, (unit, description, bounds) in INSTRUMENTS.items():
-        assert re.match(r"(vram_(arbiter|runner|sidecar|gateway|reasoner)|process|gen_ai)\.", name)
-        assert unit in ("s", "By", "") or re.fullmatch(r"\{[a-z]+\}", unit), name
+        assert re.match(
+            r"(vram_(arbiter|runner|sidecar|gateway|reasoner)|process|gen_ai|hw)\.", name
+        )
+        assert unit in ("s", "By", "1", "Cel", "W", "") or re.fullmatch(r"\{[a-z]+\}", unit), name
         assert description[0].isupper() == (not description.startswith("1 ")), description
         assert list(bounds) == sorted(set(bounds))
         assert not name.endswith(".duration") or (unit == "s" and bounds), name

@@ -21,7 +21,9 @@ from tests.support.status_page import EventStream, get, port_of
 from tests.support.waiting import until
 from tests.support.wire import WireClient
 from vram_arbiter.schemas.defaults import GIB
+from vram_arbiter.schemas.fakegpu import GPU_FILE
 from vram_arbiter.schemas.runtime import procfs
+from vram_arbiter.schemas.runtime.fakegpu_folder import locked, replace
 
 pytestmark = pytest.mark.e2e
 TRACE, PARENT = "c" * 32, "3" * 16
@@ -125,6 +127,10 @@ def granted_on(port: int) -> str:
 
 def test_prometheus_reads_the_daemon(make_arbiter: Make) -> None:
     arbiter = make_arbiter(config="log: {level: info}\n").start()
+    gpu = arbiter.gpu_folder / GPU_FILE
+    sensors = {"utilization": 0.5, "temperature_c": 64.0, "power_w": 215.5}
+    with locked(arbiter.gpu_folder):
+        replace(gpu, json.dumps({**json.loads(gpu.read_text()), "sensors": sensors}))
     with ObserverProcess(arbiter) as observer:
         hand_over(arbiter)
         for wanted in (
@@ -132,6 +138,9 @@ def test_prometheus_reads_the_daemon(make_arbiter: Make) -> None:
             r'^vram_arbiter_gpu_capacity_bytes\{vram_gpu="[^"]+"\} 8\.589934592e\+09$',
             r"^vram_arbiter_handover_duration_seconds_count\{.*\} 1\.0$",
             r"^vram_arbiter_journal_writes_total [1-9]",
+            r'^hw_gpu_utilization\{hw_id="GPU-[^"]+",hw_type="gpu"\} 0\.5$',
+            r"^hw_temperature_celsius\{.*\} 64\.0$",
+            r"^hw_power_watts\{.*\} 215\.5$",
             r'^process_cpu_time_seconds_total\{cpu_mode="user"\} ',
             r'service_name="vram-arbiter"',
         ):

@@ -126,7 +126,7 @@ def test_every_mistake_of_a_file_is_reported() -> None:
         ("wire:\n  endpoint: ipc://relative.sock\n", 2, "absolute path"),
         ("wire:\n  endpoint: ipc:///" + "x" * 120 + "\n", 2, "Linux allows 107"),
         ("wire:\n  endpoint: nonsense\n", 2, "is not an endpoint"),
-        ("gpu:\n  source: cuda\n", 2, "write auto, nvml, unified, fake:8GiB"),
+        ("gpu:\n  source: cuda\n", 2, "write auto, nvml, unified, drm, fake:8GiB"),
     ],
 )
 def test_bad_text_is_a_config_error_with_a_line(text: str, line: int, words: str) -> None:

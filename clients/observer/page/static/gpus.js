@@ -12,9 +12,10 @@ function panelOf(gpu) {
     block = el("p.block"),
     bar = el("div.bar");
   const [charged, measured, capacity, reserve, free] = Array.from({ length: 5 }, () => el("b"));
+  const sensors = el("span");
   const figures = el(
     "p.figures",
-    ...[charged, " ", term("charged"), " · ", measured, " measured · ", capacity, " capacity"],
+    ...[charged, " ", term("charged"), " · ", measured, " measured · ", capacity, " capacity", sensors],
   );
   const fixed = el("li", el("i.chip.reserve"), term("reserve"), " ", reserve);
   const legend = el(
@@ -41,12 +42,24 @@ function panelOf(gpu) {
     block,
     bar,
     fixed,
+    sensors,
     sums: { charged, measured, capacity, reserve, free },
     parts: [],
     chart: new Chart(canvas, output, `Memory of GPU ${gpu.index}`),
   };
   panels.set(gpu.index, panel);
   return panel;
+}
+
+// " · 87 % busy · 64 °C · 215 W", without what is unknown.
+function sensorsText({ utilization, temperature_c, power_w }) {
+  const told = [
+    [utilization * 100, "% busy"],
+    [temperature_c, "°C"],
+    [power_w, "W"],
+  ];
+  const known = told.filter(([figure]) => Number.isFinite(figure));
+  return known.map(([figure, unit]) => ` · ${Math.round(figure)} ${unit}`).join("");
 }
 
 // The parts of a GPU's bytes now: from its leases, so that a change shows at once.
@@ -101,6 +114,7 @@ export function renderGpus(feed) {
       free,
     };
     for (const [name, count] of Object.entries(sums)) setText(panel.sums[name], bytes(count));
+    setText(panel.sensors, sensorsText(gpu.sensors ?? {}));
     // The terms stay in the document, so that a change does not take the focus from them.
     panel.parts.forEach((item) => item.remove());
     panel.parts = parts.map(([part, count]) =>

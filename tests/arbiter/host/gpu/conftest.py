@@ -11,20 +11,29 @@ import pytest
 
 from tests.support.nvml_stub import NvmlStub
 
-SOURCE = Path(__file__).with_name("nvml_stub.c")
+HERE = Path(__file__).parent
+
+
+def compiled(source: str, library: Path) -> Path:
+    """Compile a library of one file; skips the test without a compiler."""
+    compiler = shutil.which("gcc") or shutil.which("cc")
+    if compiler is None:
+        pytest.skip(f"no C compiler: {library.name} cannot be simulated")
+    command = [compiler, "-shared", "-fPIC", "-O1", "-o", str(library), str(HERE / source)]
+    subprocess.run(command, check=True)
+    return library
 
 
 @pytest.fixture(scope="session")
 def nvml_library(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    compiler = shutil.which("gcc") or shutil.which("cc")
-    if compiler is None:
-        pytest.skip("no C compiler: libnvidia-ml.so.1 cannot be simulated")
     folder = tmp_path_factory.mktemp("nvml")
-    subprocess.run(
-        [compiler, "-shared", "-fPIC", "-O1", "-o", str(folder / "libnvidia-ml.so.1"), str(SOURCE)],
-        check=True,
-    )
-    return folder
+    return compiled("nvml_stub.c", folder / "libnvidia-ml.so.1").parent
+
+
+@pytest.fixture(scope="session")
+def xe_library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """To be loaded before the C library (LD_PRELOAD)."""
+    return compiled("xe_stub.c", tmp_path_factory.mktemp("xe") / "xe.so")
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed, UnknownGpu
 from vram_arbiter.schemas.ids import GpuId
 from vram_arbiter.schemas.runtime.fakegpu_folder import locked
+from vram_arbiter.schemas.wire.views import SensorsView
 
 
 def edit(gpu_folder, **changes):
@@ -44,6 +45,15 @@ def test_a_new_gpu_is_empty(probe):
     assert (gpu.index, gpu.total_bytes) == (0, 8 * GIB)
     reading = probe.sample(gpu.id)
     assert (reading.used_bytes, reading.total_bytes, reading.processes) == (0, 8 * GIB, ())
+
+
+def test_sensors_are_what_the_file_says(probe, gpu_folder):
+    (gpu,) = probe.gpus()
+    assert probe.sensors(gpu.id) == SensorsView()
+    edit(gpu_folder, sensors={"utilization": 0.5, "power_w": 12.5})
+    assert probe.sensors(gpu.id) == SensorsView(utilization=0.5, power_w=12.5)
+    (gpu_folder / "gpu.json").write_text("{")
+    assert probe.sensors(gpu.id) == SensorsView()
 
 
 def test_a_process_is_listed_with_its_bytes_and_a_dead_one_is_not(probe, gpu_folder):

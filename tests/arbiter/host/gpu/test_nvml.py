@@ -13,8 +13,8 @@ from vram_arbiter.schemas.ids import GpuId
 
 
 def test_gpus_come_in_the_drivers_order_under_their_uuids():
-    probe = NvmlProbe(NvmlModule(a_gpu(uuid="GPU-b", index=1), a_gpu(uuid="GPU-a", index=0)))
-    assert [found.id for found in probe.gpus()] == ["GPU-a", "GPU-b"]
+    probe = NvmlProbe(NvmlModule(a_gpu(uuid="GPU-b"), a_gpu(uuid="GPU-a")))
+    assert [(found.index, found.id) for found in probe.gpus()] == [(0, "GPU-b"), (1, "GPU-a")]
 
 
 def test_no_driver_no_gpu_unknown_gpu():
@@ -29,7 +29,7 @@ def test_no_driver_no_gpu_unknown_gpu():
 
 
 def test_one_gpu_that_fails_does_not_disturb_the_other():
-    lost, fine = a_gpu(), a_gpu(uuid="GPU-2", index=1, used=5)
+    lost, fine = a_gpu(), a_gpu(uuid="GPU-2", used=5)
     driver = NvmlModule(lost, fine)
     probe = NvmlProbe(driver)
     lost["memory_error"] = NVMLError("GPU is lost")

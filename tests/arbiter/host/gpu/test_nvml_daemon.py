@@ -106,6 +106,19 @@ def test_a_cycle_with_release_lag(
     assert (verdict["before_bytes"], verdict["after_bytes"]) == (5 * GIB, 0)
 
 
+def test_an_instance_is_leased_by_itself(nvml: NvmlStub, make_arbiter: Make) -> None:
+    """Two loads at once, one on each instance: a GPU has one at a time."""
+    nvml.instances(0, 0)
+    nvml.write()
+    daemon = make_arbiter(gpu="nvml", config=CONFIG).start(nvml.environ)
+    with WireClient(daemon.endpoint) as client:
+        client.hello("holder")
+        first, second = (client.granted(name, 3 * GIB) for name in ("first", "second"))
+        assert {first["gpu"], second["gpu"]} == {"MIG-stub-1", "MIG-stub-2"}
+        refused = client.acquire("large", 5 * GIB)
+        assert refused["error"]["code"] == "vram_insufficient", "no more than an instance has"
+
+
 @pytest.mark.parametrize("daemon", [HANGS], indirect=True)
 def test_a_call_that_hangs_is_unknown_blocks_and_recovers(
     client: WireClient, nvml: NvmlStub

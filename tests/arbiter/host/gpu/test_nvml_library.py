@@ -28,6 +28,35 @@ READ = """
         ],
     }))
 """
+ALL = """
+    from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
+    probe = NvmlProbe()
+    print(json.dumps([
+        [gpu.index, gpu.id, gpu.name, gpu.total_bytes, reading.used_bytes, reading.processes and [
+            [found.process.pid, found.used_bytes] for found in reading.processes
+        ]]
+        for gpu in probe.gpus()
+        for reading in [probe.sample(gpu.id)]
+    ]))
+"""
+SENSORS = """
+    from dataclasses import astuple
+    from vram_arbiter.arbiter.host.gpu.nvml import NvmlProbe
+    probe = NvmlProbe()
+    print(json.dumps([astuple(probe.sensors(gpu.id)) for gpu in probe.gpus()]))
+"""
+PROGRAMS = """
+    from vram_arbiter.clients.calibration.gpu import open_gpu
+    from vram_arbiter.clients.cli.doctor.machine import ask_nvml
+    from vram_arbiter.sidecars.device.capacity import capacities
+    second = open_gpu("cuda:1", {})
+    print(json.dumps([
+        capacities("cuda", {}),
+        capacities("cuda", {"CUDA_VISIBLE_DEVICES": "MIG-stub-2"}),
+        [second.environ["CUDA_VISIBLE_DEVICES"], second.read().used_bytes],
+        ask_nvml().gpus,
+    ]))
+"""
 OWN = """
     from opentelemetry.sdk.metrics import MeterProvider
     from opentelemetry.exporter.prometheus import PrometheusMetricReader
@@ -130,6 +159,9 @@ def test_a_list_that_is_refused_leaves_the_total_as_truth(nvml: NvmlStub) -> Non
     assert (said["used"], said["processes"]) == (GIB, None)
 
 
+TWO_IN_ONE = [f"instance 0 {place} 5 MIG-{place} {GIB} 0 0" for place in range(2)]
+
+
 @pytest.mark.parametrize(
     ("more", "lines", "error", "words"),
     [
@@ -137,7 +169,8 @@ def test_a_list_that_is_refused_leaves_the_total_as_truth(nvml: NvmlStub) -> Non
         ("", ["error memory 15"], "ProbeFailed", "GPU is lost"),
         ("", ["error memory 999"], "ProbeFailed", "Unknown Error"),
         ("", ["error count 999"], "NoGpu", "cannot list its GPUs"),
-        ("mig", [], "ConfigError", "MIG mode"),
+        ("mig", [], "NoGpu", "in MIG mode no instance"),
+        ("mig", TWO_IN_ONE, "ConfigError", "instance 5 of GPU 0 has several compute instances"),
     ],
 )
 def test_what_cannot_be_served_is_a_typed_error(
@@ -171,6 +204,60 @@ def test_a_gpu_that_was_lost_is_read_again_after_the_driver_came_back(nvml: Nvml
     assert "Driver Not Loaded" in said[2]
     assert "no longer lists GPU-stub-0" in said[3]
     assert said[4:] == [5, 6]
+
+
+def test_instances_stand_in_the_place_of_their_gpu(nvml: NvmlStub) -> None:
+    """Name, memory and processes are those of the instance. Of a process whose instance the driver
+    does not tell it is unknown where it runs, not that it runs nowhere."""
+    nvml.instances(GIB, 2 * GIB)
+    nvml.gpus += [f"gpu GPU-stub-b {24 * GIB} 0 3"]
+    total, name = 4 * GIB - 64 * MIB, "NVIDIA Stub MIG 1g.4gb"
+    where = [
+        "process 0 compute 4194301 5 inf 1",
+        "process 0 compute 4194302 na inf 2",
+        "process 0 graphics 4194302 7 inf 2",
+        "process 1 compute 4194303 3",
+    ]
+    nvml.write(*where)
+    assert answer_of_child(nvml, ALL) == [
+        [0, "MIG-stub-1", name, total, GIB, [[4194301, 5]]],
+        [1, "MIG-stub-2", name, total, 2 * GIB, [[4194302, 7]]],
+        [2, "GPU-stub-b", "NVIDIA Stub", 24 * GIB, 3, [[4194303, 3]]],
+    ]
+    nvml.write(*where, "process 0 compute 4194304 9")
+    assert [gpu[-1] for gpu in answer_of_child(nvml, ALL)] == [None, None, [[4194303, 3]]]
+
+
+def test_an_instance_that_was_made_anew_is_unknown(nvml: NvmlStub) -> None:
+    """NVML may use the handle of a destroyed instance for another one."""
+    gpu = f"gpu GPU-stub-0 {8 * GIB} 0 0 mig"
+    former, other = (f"{gpu};instance 0 0 1 MIG-{name} {GIB} 0" for name in ("a", "b"))
+    nvml.gpus = [*f"{former} 1".split(";")]
+    nvml.write()
+    said = answer_of_child(nvml, LOST, f"{former} 2\n{other} 3\n{other} 4\n{former} 5\n")
+    assert (said[0], said[3]) == (2, 5)
+    assert said[1] == "MIG-a is gone, MIG-b is in its place"
+    assert "no longer lists MIG-a" in said[2]
+
+
+def test_sensors_are_those_of_the_board(nvml: NvmlStub) -> None:
+    """A GPU without them is none the worse for it, and an instance is not its GPU."""
+    nvml.gpus += [f"gpu GPU-stub-1 {GIB} 0 0", f"gpu GPU-stub-2 {GIB} 0 0 mig"]
+    nvml.write(f"instance 2 0 1 MIG-1 {GIB} 0 0", "sensors 0 87 64 215400", "sensors 2 5 50 60000")
+    unknown = [None, None, None]
+    assert answer_of_child(nvml, SENSORS) == [[0.87, 64.0, 215.4], unknown, unknown]
+    nvml.write("sensors 0 87 64 215400", "error sensors 15")
+    assert answer_of_child(nvml, SENSORS) == [unknown, unknown]
+
+
+def test_programs_take_instances_for_gpus(nvml: NvmlStub) -> None:
+    nvml.instances(GIB, 2 * GIB)
+    nvml.write()
+    of_all, of_named, second, counted = answer_of_child(nvml, PROGRAMS)
+    assert of_all == {"MIG-stub-1": 4 * GIB, "MIG-stub-2": 4 * GIB}
+    assert of_named == {"MIG-stub-2": 4 * GIB}
+    assert second == ["MIG-stub-2", 2 * GIB + 64 * MIB]
+    assert counted == 2
 
 
 def test_a_program_shows_what_it_holds_itself(nvml: NvmlStub) -> None:

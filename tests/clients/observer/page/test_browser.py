@@ -1,6 +1,7 @@
 """The status page in a real headless Chromium, over a daemon with a moving scene. What it shows and
 filters is tried in every run of the tests, the rest at night."""
 
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +14,8 @@ from tests.support.status_page import get, port_of
 from tests.support.waiting import until
 from tests.support.wire import WireClient
 from vram_arbiter.schemas.defaults import GIB
+from vram_arbiter.schemas.fakegpu import GPU_FILE
+from vram_arbiter.schemas.runtime.fakegpu_folder import locked, replace
 from vram_arbiter.schemas.runtime.ports import free_port
 
 if TYPE_CHECKING:
@@ -65,7 +68,10 @@ def shown_arbiter() -> Iterator[ArbiterProcess]:
 @pytest.fixture(scope="module")
 def page(browser: "Chrome", shown_arbiter: ArbiterProcess) -> "Iterator[Page]":
     """The page over a scene: a detector in use, for which a request waits, then its eviction."""
-    port = port_of(shown_arbiter)
+    port, gpu = port_of(shown_arbiter), shown_arbiter.gpu_folder / GPU_FILE
+    with locked(gpu.parent):
+        sensors = {"utilization": 0.87, "temperature_c": 64.0}
+        replace(gpu, json.dumps({**json.loads(gpu.read_text()), "sensors": sensors}))
     until(lambda: get(port, "/events", method="HEAD").status == 200)
     shown = Page(browser, f"http://127.0.0.1:{port}/")
     with WireClient(shown_arbiter.endpoint) as client:
@@ -130,6 +136,7 @@ def test_a_lease_a_wait_and_an_eviction_are_shown_as_they_happen(page: Page) -> 
     assert NAME in harmless
     assert page.run("window.harm === undefined && document.scripts.length === 1")
     assert "detector 5.00 GiB" in page.run("document.querySelector('.bar').ariaLabel")
+    page.until(lambda: page.text(".figures").endswith("capacity · 87 % busy · 64 °C"), "sensors")
     chart = "document.querySelector('canvas').ariaLabel"
     page.until(lambda: "detector 5.00 GiB" in page.run(chart), "the chart has the lease")
     chips = page.run(
