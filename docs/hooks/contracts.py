@@ -1,7 +1,5 @@
-"""Reference pages of JSON Schemas, of the arbiter's configuration, of errors, of metrics, and of the
-findings of `vramctl doctor`."""
+"""Reference pages of JSON Schemas, of the arbiter's configuration, of errors and of metrics."""
 
-import inspect
 import json
 import re
 from collections.abc import Iterator
@@ -9,7 +7,6 @@ from pathlib import Path
 
 import yaml
 
-from vram_arbiter.clients.cli.doctor import CHECKS
 from vram_arbiter.clients.observer import names as of_the_arbiter  # noqa: F401  it describes metrics
 from vram_arbiter.reasoner.llm import names as of_language_models  # noqa: F401  as above
 from vram_arbiter.schemas.errors import CODES, VramError
@@ -154,17 +151,6 @@ def errors() -> str:
         rows.append(
             f"| `{code}` | `{error.__name__}` | {_needs(error)} | {_cell(error.__doc__ or '')} |"
         )
-    return "\n".join(rows)
-
-
-def findings() -> str:
-    """Return the table of what `vramctl doctor` examines, with the codes of each check."""
-    rows = ["| sound | warnings, errors and notes |", "| --- | --- |"]
-    for name, check, _ in CHECKS:
-        source = inspect.getsource(inspect.getmodule(check) or check)
-        codes = re.findall(rf'(?:note|warning|error)\(\s*f?"({name}\.[^"]+)"', source)
-        found = ", ".join(f"`{code}`" for code in codes)
-        rows.append(f"| {_cell(check.__doc__ or '')} | {found} |")
     return "\n".join(rows)
 
 

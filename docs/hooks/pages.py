@@ -40,7 +40,6 @@ LANGUAGES = {".py": "python", ".pl": "perl", ".yaml": "yaml", ".json": "json", "
 GENERATED: Mapping[str, Callable[[], str]] = {
     "configuration": lambda: contracts.configuration((TREE / "configs/arbiter.yaml").read_text()),
     "errors": contracts.errors,
-    "findings": contracts.findings,
     "schemas": lambda: contracts.schema_list(TREE / SCHEMAS),
     "metrics": contracts.metrics,
     **{name: partial(programs.page, name) for name in programs.parsers()},

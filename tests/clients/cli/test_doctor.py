@@ -48,12 +48,14 @@ def test_each_finding_fires_and_names_a_command(case: Case, sound_machine: Machi
     assert found[0].severity is not Severity.OK
 
 
-def test_every_finding_has_a_case() -> None:
+def test_every_finding_has_a_case_and_a_line_in_the_reference() -> None:
     text = "".join(path.read_text() for path in (ROOT / "clients/cli/doctor").glob("*.py"))
     codes = set(re.findall(r'(?:error|warning|note)\(\s*f?"([a-z]+\.[a-z-]+)', text))
     assert len(codes) > 30
     tried = {case.code for case in CASES}
     assert {code for code in codes if not any(one.startswith(code) for one in tried)} == set()
+    page = (ROOT / "docs/reference/doctor.md").read_text()
+    assert {code for code in tried if f"`{code}`" not in page} == set()
 
 
 # -- what cannot be examined

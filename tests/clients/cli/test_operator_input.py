@@ -1,7 +1,7 @@
 """What an operator may mistype, meet or forget: one line that says what is wrong and what to do,
 and the documented exit code.
 
-Real daemon, real programs.
+Real daemon, real programs. The table of exit codes is in docs/reference/exit-codes.md.
 """
 
 import grp
