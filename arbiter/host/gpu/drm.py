@@ -35,21 +35,22 @@ _UNITS = {"": 1, "KiB": KIB, "MiB": MIB}
 
 
 class DrmProbe:
-    """`GpuProbe` over all GPUs of these drivers, in the order of the PCI bus.
+    """`GpuProbe` over the GPUs of these drivers that have memory, in the order of the PCI bus.
 
     A GPU's id is `AMD-` with the number of its chip, which ROCm's UUID has behind `GPU-`; `PCI-`
     with its place for one without a number. `root` is where /sys and /dev are looked for. Raises
-    NoGpu.
+    NoGpu or ProbeFailed.
     """
 
     def __init__(self, pids: PidMap, root: Path = Path("/")) -> None:
         self._pids = pids
         self._root = root
         cards = [card for card in (root / CARDS).glob("card*/device") if _driver(card) in _MEMORY]
-        self._folders = {_id(card): card for card in sorted(cards, key=_place)}
-        if not self._folders:
+        found = [card for card in sorted(cards, key=_place) if self._memory(card)[1]]
+        self._folders = {_id(card): card for card in found}
+        if not found:
             raise NoGpu(
-                f"no GPU of the drivers {' and '.join(_MEMORY)}",
+                f"no GPU of the drivers {' and '.join(_MEMORY)} has memory of its own",
                 hint="see lspci -k, or start with --gpu fake:8GiB to simulate a GPU",
             )
 
@@ -92,8 +93,8 @@ class DrmProbe:
         share counts once, for the first one."""
         if not self._pids.knows:
             return None
-        proc, clients, found = self._pids.listed_in, set[str](), list[ProcessUse]()
-        pids = sorted(int(name) for name in os.listdir(proc) if name.isdecimal())
+        proc, clients, found = self._pids.listed_in, set[str | None](), list[ProcessUse]()
+        pids = _pids(proc)
         if 1 not in pids:
             return None  # mounted so that processes of other users are hidden
         for pid in pids:
@@ -103,7 +104,7 @@ class DrmProbe:
                 continue  # it ended meanwhile
             except OSError:
                 return None
-            own = {one["drm-client-id"]: one for one in told}
+            own = {one.get("drm-client-id"): one for one in told}
             if new := own.keys() - clients:
                 clients |= new
                 used = [_resident(own[client]) for client in new]
@@ -121,7 +122,8 @@ def amd_memory(folder: Path, _: Path) -> tuple[int, int]:
 
 def xe_memory(folder: Path, root: Path) -> tuple[int, int]:
     """What `xe` answers at its render node. Without CAP_PERFMON it calls no byte used."""
-    node = root / NODES / next(folder.glob("drm/renderD*")).name
+    (name,) = (node.name for node in folder.glob("drm/renderD*"))
+    node = root / NODES / name
     with node.open("r+b", buffering=0) as file:
         asked = bytearray(_QUESTION.pack(0, XE_REGIONS, 0, 0))
         fcntl.ioctl(file, XE_QUERY, asked)
@@ -132,7 +134,7 @@ def xe_memory(folder: Path, root: Path) -> tuple[int, int]:
     (count,) = struct.unpack_from("=I", answer)
     regions = [_REGION.unpack_from(answer, 8 + at * _REGION.size) for at in range(count)]
     used, total = (sum(one[at] for one in regions if one[0] == XE_VRAM) for at in (4, 3))
-    if not used:  # the driver itself uses some
+    if total and not used:  # the driver itself uses some; an integrated GPU has no memory
         raise PermissionError(f"{node} hides what is used; the arbiter needs CAP_PERFMON")
     return used, total
 
@@ -145,6 +147,13 @@ _MEMORY: dict[str, Callable[[Path, Path], tuple[int, int]]] = {
 
 
 # -- processes
+def _pids(proc: Path) -> list[int]:
+    try:
+        return sorted(int(name) for name in os.listdir(proc) if name.isdecimal())
+    except OSError:
+        return []
+
+
 def _clients(process: Path) -> Iterator[dict[str, str]]:
     """Yield what a process's files of GPUs tell. Raises OSError where it may not be looked at."""
     for name in os.listdir(process / "fd"):

@@ -94,9 +94,10 @@ def test_gpus_come_in_the_order_of_the_bus_with_the_drivers_totals(root: Path) -
 @pytest.mark.parametrize("text", [None, "", "none"])
 def test_a_total_that_is_not_told_is_unknown(root: Path, text: str | None) -> None:
     used = root / "sys" / "class" / "drm" / "card1" / "device" / "mem_info_vram_used"
+    probe = probe_of(root)
     used.unlink() if text is None else used.write_text(text)
     with pytest.raises(ProbeFailed, match=FIRST):
-        probe_of(root).sample(AMD)
+        probe.sample(AMD)
 
 
 def test_a_process_has_the_bytes_of_its_clients_on_the_gpu(root: Path) -> None:
@@ -150,6 +151,8 @@ def test_a_container_does_not_see_the_processes_of_its_host(root: Path) -> None:
     shown = DrmProbe(PidMap(proc=root / "proc", host_proc=root / "host" / "proc"), root)
     (use,) = shown.sample(AMD).processes or ()
     assert (use.process.pid, use.used_bytes) == (-70, 5), "of no process here"
+    away = DrmProbe(PidMap(proc=root / "proc", host_proc=root / "nothing"), root)
+    assert away.sample(AMD).processes is None
 
 
 def test_sensors(root: Path) -> None:
@@ -166,7 +169,7 @@ import json, sys
 from pathlib import Path
 from vram_arbiter.arbiter.host.gpu.drm import DrmProbe
 from vram_arbiter.arbiter.host.gpu.pids import PidMap
-from vram_arbiter.schemas.errors import ProbeFailed
+from vram_arbiter.schemas.errors import VramError
 root = Path(sys.argv[1])
 try:
     probe = DrmProbe(PidMap("own", proc=root / "proc"), root)
@@ -174,7 +177,7 @@ try:
     reading = probe.sample(gpu.id)
     listed = [[one.process.pid, one.used_bytes] for one in reading.processes]
     print(json.dumps([gpu.id, gpu.total_bytes, reading.used_bytes, reading.total_bytes, listed]))
-except ProbeFailed as error:
+except VramError as error:
     print(json.dumps(error.message))
 """
 
@@ -206,5 +209,9 @@ def test_xe_tells_its_memory_by_ioctl(tmp_path: Path, xe_library: Path) -> None:
     ]  # fmt: skip
     write(tmp_path, {"dev/dri/renderD128": f"0 {64 * GIB} 0\n1 {8 * GIB} 0"})
     assert "needs CAP_PERFMON" in answer_of_child(xe_library, tmp_path)
+    write(tmp_path, {"dev/dri/renderD128": f"0 {64 * GIB} 0"})
+    assert "has memory of its own" in answer_of_child(xe_library, tmp_path), "integrated"
     (tmp_path / "dev" / "dri" / "renderD128").unlink()
     assert "No such file" in answer_of_child(xe_library, tmp_path)
+    (folder / "drm" / "renderD128").rmdir()
+    assert f"memory of {FIRST} cannot be read" in answer_of_child(xe_library, tmp_path)

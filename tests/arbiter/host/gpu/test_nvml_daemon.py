@@ -11,7 +11,7 @@ import pytest
 
 from tests.support.nvml_stub import GIB, MIB, NvmlStub
 from tests.support.process import ArbiterProcess, Make
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, until
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
@@ -137,6 +137,16 @@ def test_a_call_that_hangs_is_unknown_blocks_and_recovers(
     nvml.write()
     event(client, "probe_ok")
     client.push("granted")
+
+
+def test_a_sensor_that_hangs_delays_nothing(client: WireClient, nvml: NvmlStub) -> None:
+    nvml.write("hang sensors")
+    assert "sensors" not in client.ask("status")["gpus"][0]
+    assert granted(client, "holder", GIB)
+    assert client.ask("status")["gpus"][0]["measured_used_bytes"] == 0, "memory is still read"
+    nvml.write("sensors 0 87 64 215400")
+    shown = until(lambda: client.ask("status")["gpus"][0].get("sensors"))
+    assert shown == {"utilization": 0.87, "temperature_c": 64.0, "power_w": 215.4}
 
 
 def test_an_error_code_is_unknown_blocks_and_recovers(client: WireClient, nvml: NvmlStub) -> None:
