@@ -10,7 +10,6 @@ at its edge are served by hand (`serve`).
 import gc
 import time
 from array import array
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
@@ -47,7 +46,7 @@ class Report:
     unproven: int = 0
     wall_s: float = 0.0
     cpu_s: float = 0.0
-    verbs: Counter[str] = field(default_factory=Counter)
+    verbs: dict[str, int] = field(default_factory=dict)
     story: list[Action] = field(default_factory=list)
     error: str = ""
 
@@ -144,7 +143,7 @@ class Search:
                 self._fail([*self.story(state), action], f"{type(error).__name__}: {error}")
                 return
             report.transitions += 1
-            report.verbs[action[0]] += 1
+            report.verbs[action[0]] = report.verbs.get(action[0], 0) + 1
             met, is_new = self._meet(world, state, action)
             if is_new:
                 following.append((met, freeze(world)))
