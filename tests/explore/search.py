@@ -8,6 +8,7 @@ at its edge are served by hand (`serve`).
 """
 
 import gc
+import random
 import time
 from array import array
 from collections.abc import Iterable
@@ -179,7 +180,7 @@ class Search:
         """Look for a state from which no path serves those that wait."""
         report, served = self.report, self._served
         self._spread()
-        for state, frozen in edge:
+        for state, frozen in random.Random(0).sample(edge, len(edge)):
             if time.perf_counter() > until:
                 break
             if served[state]:
