@@ -22,6 +22,7 @@ ALONE = kind("alone", 3 * GIB, mode="exclusive")
 RETURNS = kind("returns", 5 * GIB, standby=True)
 STAYS = kind("stays", 3 * GIB, evictable=False)
 TALKS = kind("talks", 5 * GIB, ttl_s=12.0)
+TALKS_BACK = kind("talks back", 5 * GIB, ttl_s=12.0, standby=True)
 FAULTS = {"crash": 1, "restart": 1, "late": 1, "fail": 1, "cancel": 1, "lie": 1}
 
 SCENARIOS: Mapping[str, Scenario] = {
@@ -39,6 +40,10 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario("talk", (TALKS,), faults={"drop": 2}, talks=True),
         Scenario("talk-turns", (TALKS, TALKS), faults={"drop": 1}, talks=True),
         Scenario("talk-restart", (TALKS, TALKS), faults={"restart": 1, "late": 1}, talks=True),
+        Scenario("talk-cancel", (TALKS, TALKS), faults={"cancel": 1, "drop": 1}, talks=True),
+        Scenario("talk-timeout", (TALKS, TALKS), 1, 1, 3.0, {"drop": 1}, talks=True),
+        Scenario("talk-standby", (TALKS_BACK, TALKS), faults={"drop": 1}, talks=True),
+        Scenario("talk-crash", (TALKS, TALKS), faults={"crash": 1, "restart": 1}, talks=True),
         Scenario("three", (BIG, BIG, BIG)),
         Scenario("kinds", (BIG, PEAKY, ALONE), faults={"crash": 1}),
         Scenario("two-gpus", (BIG, BIG, BIG), gpus=2),

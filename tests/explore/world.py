@@ -64,8 +64,8 @@ class Scenario:
         acquires: How often each client asks.
         faults: How often these verbs may happen in one story.
         lags: Whether the driver returns memory late.
-        talks: Whether messages are under way until they are sent and heard; else they arrive at
-            once.
+        talks: Whether messages are under way until they are sent and heard, and readings come at
+            once; else it is the other way round.
     """
 
     name: str
@@ -147,9 +147,7 @@ class World:
         self.do_restart()
         for client in self.clients.values():
             client.act("connect", self)
-            self._deliver()
-        for gpu in gpus:
-            self.do_read(gpu)
+            self._deliver(mail=True, readings=True)
 
     # -- what may happen
     def actions(self) -> list[Action]:
@@ -178,13 +176,20 @@ class World:
             self.clients[whose].act(verb, self)
         else:
             getattr(self, f"do_{verb}")(*whose.split())
-        if not self.scenario.talks:
-            self._deliver()
+        self._deliver(mail=not self.scenario.talks, readings=self.scenario.talks)
         self._check(state_of(self.engine))
 
-    def _deliver(self) -> None:
-        while mail := [one for one in self.clients.values() if one.has_mail()]:
-            mail[0].act("send" if mail[0].up else "hear", self)
+    def _deliver(self, *, mail: bool, readings: bool) -> None:
+        """Let arrive what is not under way in this scenario, in the order of clients and GPUs."""
+        while True:
+            under_way = [one for one in self.clients.values() if mail and one.has_mail()]
+            read = [one.gpu for one in self.devices.values() if readings and one.reading]
+            if under_way:
+                under_way[0].act("send" if under_way[0].up else "hear", self)
+            elif read:
+                self.do_read(read[0])
+            else:
+                return
 
     # -- the engine
     def post(self, event: ev.Event) -> None:
@@ -317,11 +322,7 @@ class World:
         until = self._decisive_at()
         assert until is not None
         for _ in range(SLEEP_EVENTS_MAX):
-            self._deliver()
-            for gpu in [device.gpu for device in self.devices.values() if device.reading]:
-                self.do_read(gpu)
-            if self._is_busy():
-                continue
+            self._deliver(mail=True, readings=True)
             at = self._next_at()
             if at is None or at > until:
                 return
