@@ -70,7 +70,7 @@ def test_the_detector_finds_the_target_and_turns_down_the_absent(scenes: range):
     assert alarms < len(scenes)  # of three times as many; the model card tells how often
 
 
-EMPTY, HELD, ANOTHER = "empty", "held", "holds another"
+EMPTY, HELD, ANOTHER = "empty", "held", "holds another of its color"
 """Groups of questions: a row of each model card begins with each."""
 
 
