@@ -30,7 +30,7 @@ BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help setup setup-core setup-worlds setup-vllm jetson demo test test-core test-gpu nightly mutation fuzz measure lint format \
-	sbom wheel chaos sim bench bench-doors bench-gateway bench-switch schemas docs clean
+	lock sbom wheel chaos sim bench bench-doors bench-gateway bench-switch schemas docs clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -113,10 +113,13 @@ schemas: setup ## write the JSON Schemas after a model changed
 docs: setup ## the documentation site in build/site; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-sbom: setup ## CycloneDX list of the packages of constraints.txt: out/sbom.cdx.json
+lock: ## constraints-hashed.txt, as pyproject.toml asks: ARGS=--upgrade, or ARGS="-P numpy"
+	@bash .ci/lock $(ARGS)
+
+sbom: setup ## CycloneDX list of the packages of constraints-hashed.txt: out/sbom.cdx.json
 	mkdir -p out
 	$(BIN)/cyclonedx-py requirements --pyproject pyproject.toml --output-reproducible \
-		--output-file out/sbom.cdx.json constraints.txt
+		--output-file out/sbom.cdx.json constraints-hashed.txt
 
 wheel: setup ## dist/vram_arbiter-*.whl, the same bytes wherever it is built
 	$(BIN)/python -m hatchling build -t wheel

@@ -1,6 +1,7 @@
 """The set-up script finds an interpreter that works, and says what to do when there is none."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -9,7 +10,10 @@ from pathlib import Path
 import pytest
 
 TREE = Path(__file__).parents[2]
-TOOLS = ("bash", "cat", "cksum", "dirname", "env", "rm", "uname")
+TOOLS = ("bash", "cat", "cksum", "dirname", "env", "grep", "rm", "uname")
+
+
+HASHED = "constraints-hashed.txt"
 
 
 @pytest.fixture
@@ -18,7 +22,7 @@ def project(tmp_path: Path) -> Path:
     but the basic tools."""
     folder = tmp_path / "project"
     (folder / ".ci").mkdir(parents=True)
-    for name in (".ci/setup", "pyproject.toml", "constraints.txt"):
+    for name in (".ci/setup", "pyproject.toml", HASHED):
         shutil.copy(TREE / name, folder / name)
     (folder / "bin").mkdir()
     for tool in TOOLS:
@@ -83,20 +87,23 @@ def test_it_takes_the_first_interpreter_that_works_and_works_once(project: Path)
     (project / "bin" / "ln").symlink_to(str(shutil.which("ln")))
     first = set_up(project, "core")
     assert first.returncode == 0, first.stderr
-    made, installed = log.read_text(encoding="utf-8").splitlines()
+    made, *installed = log.read_text(encoding="utf-8").splitlines()
     assert made == f"venv --quiet --clear --python {project}/bin/python3.13 .venv-core"
-    assert (
-        installed
-        == "pip install --python .venv-core/bin/python -c constraints.txt --group dev -e ."
-    )
+    pinned = f"--python .venv-core/bin/python -c {HASHED} -b {HASHED}"
+    listed = ".venv-core/requirements.txt"
+    assert installed == [
+        f"pip compile --quiet {pinned} --group dev -o {listed} pyproject.toml",
+        f"pip install {pinned} --require-hashes -r {listed}",
+        f"pip install {pinned} --no-deps -e .",
+    ]
 
     assert set_up(project, "core").returncode == 0
-    assert len(log.read_text(encoding="utf-8").splitlines()) == 2, "nothing changed, nothing to do"
+    assert len(log.read_text(encoding="utf-8").splitlines()) == 4, "nothing changed, nothing to do"
 
-    with open(project / "constraints.txt", "a", encoding="utf-8") as file:
+    with open(project / HASHED, "a", encoding="utf-8") as file:
         file.write("# changed\n")
     assert set_up(project, "core").returncode == 0
-    assert log.read_text(encoding="utf-8").splitlines()[2:] == [installed], (
+    assert log.read_text(encoding="utf-8").splitlines()[4:] == installed, (
         "only the packages are installed anew"
     )
 
@@ -116,7 +123,7 @@ def full(project: Path) -> Path:
     script(
         project,
         "uv",
-        f'[ "$1" = --version ] && exit 0; echo "uv $*" >>{log}; case "$*" in *,gstreamer*) [ ! -e '
+        f'[ "$1" = --version ] && exit 0; echo "uv $*" >>{log}; case "$*" in *"--extra gstreamer"*) [ ! -e '
         f"{project}/unbuildable ] || exit 1 ;; esac; "
         f'[ "$1" != venv ] || {{ mkdir -p "${{@: -1}}/bin"; ln -s {sys.executable} "${{@: '
         '-1}/bin/python"; }',
@@ -138,11 +145,11 @@ def full(project: Path) -> Path:
 
 
 def installed(project: Path) -> list[str]:
-    """What uv was asked to install with its dependencies, in order; robosuite comes without."""
+    """The extras that uv was asked for, in order; robosuite comes without its dependencies."""
     lines = (project / "log").read_text(encoding="utf-8").splitlines()
     asked = [line for line in lines if line.startswith("uv pip")]
-    assert asked[-1].endswith("-c constraints.txt --no-deps robosuite")
-    return [line.rpartition(" ")[2] for line in asked if "--no-deps" not in line]
+    assert asked[-1].endswith("--require-hashes --no-deps -r .venv/robosuite.txt")
+    return [" ".join(re.findall(r"--extra (\w+)", line)) for line in asked if " compile " in line]
 
 
 def test_without_gstreamer_everything_else_is_installed_and_what_is_missing_is_said(
@@ -152,18 +159,18 @@ def test_without_gstreamer_everything_else_is_installed_and_what_is_missing_is_s
     assert result.returncode == 0, result.stderr
     assert "cameras through GStreamer are left out" in result.stderr
     assert "sudo apt-get install gcc libc6-dev pkg-config libgirepository1.0-dev" in result.stderr
-    assert installed(full) == [".[all]"]
+    assert installed(full) == ["all"]
     assert "apt-get" not in (full / "log").read_text(encoding="utf-8"), "only root may"
 
 
 def test_libraries_that_came_later_are_a_reason_to_begin_again(full: Path) -> None:
     assert set_up(full, "full").returncode == 0
     assert set_up(full, "full").returncode == 0
-    assert installed(full) == [".[all]"]
+    assert installed(full) == ["all"]
     (full / "headers").touch()
     result = set_up(full, "full")
     assert result.returncode == 0, result.stderr
-    assert installed(full) == [".[all]", ".[all,gstreamer]"]
+    assert installed(full) == ["all", "all gstreamer"]
     assert set_up(full, "full").returncode == 0
     assert len(installed(full)) == 2
 
@@ -182,7 +189,7 @@ def test_root_gets_the_libraries_by_apt(full: Path) -> None:
     assert first == "apt-get update -qq"
     assert second.startswith("apt-get install -y -qq")
     assert "gstreamer1.0-plugins-good" in second
-    assert installed(full) == [".[all,gstreamer]"]
+    assert installed(full) == ["all gstreamer"]
 
 
 @pytest.mark.parametrize("trouble", ["offline", "unbuildable"])
@@ -194,4 +201,4 @@ def test_trouble_with_gstreamer_stops_nothing_else(full: Path, trouble: str) -> 
         pytest.skip("this machine lacks EGL, too, and that is wanted")
     assert result.returncode == 0, result.stderr
     assert "cameras through GStreamer are left out" in result.stderr
-    assert installed(full)[-1] == ".[all]"
+    assert installed(full)[-1] == "all"
