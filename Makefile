@@ -118,7 +118,7 @@ schemas: setup ## write the JSON Schemas after a model changed
 docs: setup ## the documentation site in build/site; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-lock: setup ## constraints-hashed.txt, as pyproject.toml asks: ARGS=--upgrade, or ARGS="-P numpy"
+lock: ## constraints-hashed.txt, as pyproject.toml asks: ARGS=--upgrade, or ARGS="-P numpy"
 	@bash .ci/lock $(ARGS)
 
 sbom: setup ## CycloneDX list of the packages of constraints-hashed.txt: out/sbom.cdx.json
