@@ -8,6 +8,7 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from tests.support import machines
 from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
 
-pytest_plugins = ["tests.support.leftovers"]
+pytest_plugins = ["tests.support.leftovers", "vram_arbiter.testing.plugin"]
 _ROOT = Path(__file__).parents[1]
 machines.register()
 # Programs that tests start would compile all that they import, each time.
@@ -123,21 +124,10 @@ def own_log() -> Iterator[None]:
         root.removeHandler(handler)
 
 
-@pytest.fixture
-def make_arbiter() -> Iterator[Callable[..., ArbiterProcess]]:
-    """`make_arbiter(gpu="fake:8GiB", arguments=(), config=None)` prepares a daemon; call `.start()`
-    on it. Ended at teardown."""
-    made: list[ArbiterProcess] = []
-
-    def make(
-        gpu: str = "fake:8GiB", arguments: tuple[str, ...] = (), config: str | None = None
-    ) -> ArbiterProcess:
-        made.append(ArbiterProcess(gpu, arguments, config, prepared=True))
-        return made[-1]
-
-    yield make
-    for arbiter in made:
-        arbiter.close()
+@pytest.fixture(scope="session")
+def arbiter_process() -> Callable[..., ArbiterProcess]:
+    """Daemons of `make_arbiter`: forked."""
+    return partial(ArbiterProcess, prepared=True)
 
 
 @pytest.fixture

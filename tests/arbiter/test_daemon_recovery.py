@@ -19,6 +19,7 @@ from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime.procfs import boot_id, start_ticks
+from vram_arbiter.testing.gpu import FakeGpu
 
 pytestmark = pytest.mark.e2e
 
@@ -220,13 +221,7 @@ def test_a_measured_footprint_is_charged_after_a_restart_and_a_reboot(make_arbit
 
 def hang(arbiter: ArbiterProcess) -> None:
     """Readings of the simulated GPU hang from now on."""
-    path = arbiter.gpu_folder / fakegpu.GPU_FILE
-    config = fakegpu.parse_config(path.read_text())
-    temporary = path.with_name(".new")
-    temporary.write_text(
-        fakegpu.dump_config(config.model_copy(update={"faults": fakegpu.Faults(probe="hang")}))
-    )
-    temporary.rename(path)
+    FakeGpu(arbiter.gpu_folder).edit(probe="hang")
 
 
 def test_a_hanging_driver_does_not_hold_up_the_stop(make_arbiter: Make) -> None:

@@ -39,7 +39,7 @@ from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
 from vram_arbiter.reasoner.hints import Hints
-from vram_arbiter.schemas import fakegpu
+from vram_arbiter.testing.gpu import FakeGpu
 
 COPY_BYTES_PER_S = 6_000_000_000
 TURN_RAD = 2.0
@@ -128,10 +128,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("out/bench/prepare.json"))
     options = parser.parse_args()
     with arbiter(SHIPPED + NO_HOLD + HOST_RAM) as daemon:
-        path = daemon.gpu_folder / fakegpu.GPU_FILE
-        config = fakegpu.FakeGpuConfig.model_validate_json(path.read_text(encoding="utf-8"))
-        slow = config.model_copy(update={"throttle_bytes_per_s": COPY_BYTES_PER_S})
-        path.write_text(fakegpu.dump_config(slow), encoding="utf-8")
+        FakeGpu(daemon.gpu_folder).edit(throttle_bytes_per_s=COPY_BYTES_PER_S)
         rows = asyncio.run(_measure(daemon, options.rounds))
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps([dataclasses.asdict(row) for row in rows], indent=1) + "\n")

@@ -354,7 +354,7 @@ def arbiter(config: str = WIDE, gpu: str = "fake:8GiB") -> Iterator[ArbiterProce
         daemon.start()
         yield daemon
         if daemon.process is not None and daemon.process.poll() is not None:
-            raise RuntimeError(f"the daemon ended with {daemon.process.returncode}:\n{daemon.log}")
+            raise RuntimeError(f"the daemon ended with {daemon.process.wait()}:\n{daemon.log}")
     finally:
         daemon.close()
 

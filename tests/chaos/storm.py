@@ -39,7 +39,7 @@ from vram_arbiter.schemas.codec import to_map
 from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.runtime.fakegpu_folder import locked
+from vram_arbiter.testing.gpu import FakeGpu
 
 STEPS = {
     "queued": "waiting",
@@ -431,15 +431,8 @@ class Storm:
     def _set_gpu(self, release_lag_s: float = LAG_S, faults: dict[str, Any] | None = None) -> None:
         """Not on the loop: whoever holds the GPU's lock may have been stopped, and the loop lets
         it go on."""
-        path = self._arbiter.gpu_folder / fakegpu.GPU_FILE
-        with locked(self._arbiter.gpu_folder):
-            config = fakegpu.parse_config(path.read_text())
-            changed = config.model_copy(
-                update={"release_lag_s": release_lag_s, "faults": fakegpu.Faults(**(faults or {}))}
-            )
-            temporary = path.with_name(".storm.tmp")
-            temporary.write_text(fakegpu.dump_config(changed))
-            temporary.rename(path)
+        gpu = FakeGpu(self._arbiter.gpu_folder)
+        gpu.edit(release_lag_s=release_lag_s, faults=faults or {})
 
     def _mount_state(self) -> bool:
         """A small disk for the daemon's state, where mounting is permitted."""

@@ -19,7 +19,6 @@ from tests.support.stage import GIB, LAG_S, PATIENCE_S
 from tests.support.stage import Stage as OneDaemon
 from tests.support.wire import WireClient
 from vram_arbiter.clients.cli.replies import UNREACHABLE
-from vram_arbiter.schemas import fakegpu
 
 pytestmark = pytest.mark.e2e
 RESIDUE = GIB // 4
@@ -79,7 +78,7 @@ def test_1_the_next_one_loads_when_the_memory_is_back_and_nothing_stays_failed(
     stage: Stage,
 ) -> None:
     """llama-swap#97: it starts too early, fails, and the failed state then stays."""
-    stage.configure(release_lag_s=0.6)
+    stage.gpu.edit(release_lag_s=0.6)
     first = stage.spawn("first-1", 5)
     first.until("ready")
     second = stage.spawn("second-1", 5)
@@ -88,26 +87,26 @@ def test_1_the_next_one_loads_when_the_memory_is_back_and_nothing_stays_failed(
         "nothing but the context that the first one keeps"
     )
     assert stage.event("verified", consumer="first-1")["verdict"] == "verified"
-    stage.configure(release_lag_s=LAG_S)
+    stage.gpu.edit(release_lag_s=LAG_S)
 
 
 def test_1_while_the_gpu_cannot_be_read_no_figure_of_it_is_printed(stage: Stage) -> None:
     """comfyui-mcp#2050: "1205 MB free", and 24 GB a moment later. A failed poll must print
     nothing."""
     asked_until(lambda: stage.vramctl("status"), "free 7.71 GiB")
-    stage.configure(faults=fakegpu.Faults(probe="fail"))
+    stage.gpu.edit(probe="fail")
     shown = asked_until(lambda: stage.vramctl("status"), "measured: unknown")
     assert "free" not in shown
     waiter = stage.spawn("waiter-1", 1)
     stage.event("queued", consumer="waiter-1")
     assert "the GPU cannot be read" in stage.vramctl("why", "waiter-1")
-    stage.configure(faults=fakegpu.Faults())
+    stage.gpu.edit(probe="ok")
     waiter.until("ready")
 
 
 def test_2_an_unload_that_does_not_unload_is_named_until_its_process_ends(stage: Stage) -> None:
     """Triton#2023, vLLM#47654, IsaacLab-Arena#670: +8358 MiB over the baseline after "cleanup"."""
-    stage.configure(faults=fakegpu.Faults(leak_bytes=4 * GIB))
+    stage.gpu.edit(leak_bytes=4 * GIB)
     leaky = stage.spawn("leaky", 5)
     leaky.until("ready")
     waiter = stage.spawn("waiter-2", 5)

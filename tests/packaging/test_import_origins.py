@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 TREE = Path(__file__).parents[2]
-PACKAGES = ("arbiter", "clients", "sidecars", "runner", "reasoner", "schemas")
+PACKAGES = ("arbiter", "clients", "sidecars", "runner", "reasoner", "schemas", "testing")
 HEAVY = (
     "torch",
     "torchvision",
@@ -32,7 +32,7 @@ HEAVY = (
 
 BASE_MODULES = [
     ".".join(("vram_arbiter", *path.relative_to(TREE).with_suffix("").parts))
-    for package in ("arbiter", "clients", "schemas")
+    for package in ("arbiter", "clients", "schemas", "testing")
     for path in sorted((TREE / package).rglob("*.py"))
     if path.name not in ("__init__.py", "__main__.py")
     if {"observer", "top"}.isdisjoint(path.parts)  # these need an extra

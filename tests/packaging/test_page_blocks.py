@@ -30,6 +30,7 @@ from vram_arbiter.schemas.config.gateway import load_gateway, load_keys
 from vram_arbiter.schemas.config.observer import load_observer
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.manifest.load import parse_manifest
+from vram_arbiter.testing.scenario import load_scenario
 
 HISTORY = "CHANGELOG.md"  # speaks of the past
 LANGUAGES = {"console", "ini", "json", "python", "sh", "text", "yaml"}
@@ -233,6 +234,7 @@ KINDS: Mapping[frozenset[str], Callable[[str], object]] = {
     ),
     frozenset({"hooks"}): lambda text: load_observer(text, "page"),
     frozenset({"http"}): lambda text: load_observer(text, "page"),
+    frozenset({"steps"}): lambda text: load_scenario(text, "page"),
     frozenset({"gpu"}): lambda text: load_config(text, "page"),
     frozenset({"revoke"}): lambda text: load_config(text, "page"),
     frozenset({"servers"}): lambda text: load_gateway(text, "page"),

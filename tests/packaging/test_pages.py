@@ -6,7 +6,8 @@ from pathlib import Path
 
 TREE = Path(__file__).parents[2]
 FOLDERS = (
-    "arbiter|clients|schemas|sidecars|runner|reasoner|configs|examples|docs|tests|training|src"
+    "arbiter|clients|schemas|sidecars|runner|reasoner|testing|configs|examples|docs|"
+    "tests|training|src"
 )
 PATH = re.compile(rf"`((?:{FOLDERS}|\.ci)/[\w./-]*|[\w-]+\.(?:md|toml|txt))(?:::(\w+))?`")
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)(?:#([\w-]+))?\)")

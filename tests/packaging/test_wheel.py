@@ -1,5 +1,5 @@
-"""The wheel holds the product and its data: no test, no training code. It is built from what the
-images copy, and installed as they do."""
+"""The wheel holds the product and its data: no test of ours, no training code. It is built from
+what the images copy, and installed as they do."""
 
 import ensurepip
 import os
@@ -56,6 +56,7 @@ def test_the_product_and_its_data_are_there_under_one_name(names: list[str]) -> 
         "vram_arbiter/arbiter/offline/__main__.py",
         "vram_arbiter/configs/arbiter.yaml",
         "vram_arbiter/schemas/json/arbiter.json",
+        "vram_arbiter/testing/plugin.py",
     }
     licenses = {name.rsplit("/", 1)[-1] for name in names if "/licenses/" in name}
     assert licenses == {"LICENSE", "NOTICE"}
@@ -65,7 +66,7 @@ def test_no_tests_and_no_training_code(names: list[str]) -> None:
     odd = [
         name
         for name in names
-        if {"tests", "testing", "training"} & set(name.split("/"))
+        if {"tests", "training"} & set(name.split("/"))
         or name.rsplit("/", 1)[-1].startswith(("test_", "conftest"))
     ]
     assert not odd
@@ -87,3 +88,4 @@ def test_an_image_builds_from_what_it_copies(source: Path, wheel: Path, tmp_path
     assert (tmp_path / "target/vram_arbiter/configs/containers/compose.yaml").exists()
     (entry_points,) = (tmp_path / "target").glob("*.dist-info/entry_points.txt")
     assert "vram-arbiter = vram_arbiter.arbiter" in entry_points.read_text()
+    assert "[pytest11]\nvram_arbiter.testing.plugin = " in entry_points.read_text()

@@ -131,7 +131,15 @@ def test_no_other_module_reads_yaml() -> None:
     """Each loader of its own would need these limits again; writing needs none."""
     users = {
         str(path.relative_to(ROOT))
-        for package in ("arbiter", "clients", "reasoner", "runner", "schemas", "sidecars")
+        for package in (
+            "arbiter",
+            "clients",
+            "reasoner",
+            "runner",
+            "schemas",
+            "sidecars",
+            "testing",
+        )
         for path in (ROOT / package).rglob("*.py")
         if re.search(
             r"^\s*(from yaml|(import|from) ruamel)\b|(?<![.\w])yaml\.(?!safe_dump\b)\w",

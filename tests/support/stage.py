@@ -10,6 +10,7 @@ from tests.support.waiting import PATIENCE_S
 from tests.support.wire import WireClient
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.defaults import GIB
+from vram_arbiter.testing.gpu import FakeGpu
 
 CAPACITY = 8 * GIB
 LAG_S = 0.15
@@ -21,19 +22,12 @@ class Stage:
 
     def __init__(self, program: str, config: str) -> None:
         self.arbiter = ArbiterProcess(config=config, prepared=True).start()
-        self.configure(release_lag_s=LAG_S)
+        self.gpu = FakeGpu(self.arbiter.gpu_folder)
+        self.gpu.edit(release_lag_s=LAG_S)
         self.errors = self.arbiter.runtime / "errors.log"
         self._program = program
         self.children: list[Child] = []
         self.watcher = self._subscribed()
-
-    def configure(self, **changes: Any) -> None:
-        """Change the simulated GPU."""
-        path = self.arbiter.gpu_folder / fakegpu.GPU_FILE
-        config = fakegpu.parse_config(path.read_text()).model_copy(update=changes)
-        temporary = path.with_name(".new")
-        temporary.write_text(fakegpu.dump_config(config))
-        temporary.rename(path)
 
     def watch(self) -> WireClient:
         """Return a fresh subscriber: its first events are those from now on."""
@@ -72,7 +66,7 @@ class Stage:
         for child in self.children:
             child.close()
         self.children.clear()
-        self.configure(faults=fakegpu.Faults())
+        self.gpu.edit(faults={})
         watcher = self.watch()
         while not _clean(watcher.ask("status")):
             watcher.receive(0.02)  # the next event; the GPU is being read meanwhile

@@ -1,20 +1,16 @@
 """Waiting in tests: for a condition that shows from outside, and for a story with an end."""
 
 import asyncio
-import threading
-import time
 from collections.abc import Awaitable, Callable
+
+from vram_arbiter.testing import waiting
 
 PATIENCE_S = 60.0
 
 
 def until[T](condition: Callable[[], T], deadline_s: float = PATIENCE_S) -> T:
     """Poll until the condition is true, and return its value; AssertionError at the deadline."""
-    ends, pause = time.monotonic() + deadline_s, threading.Event()
-    while not (found := condition()):
-        assert time.monotonic() < ends, f"not true within {deadline_s:g} s"
-        pause.wait(0.01)
-    return found
+    return waiting.eventually(condition, deadline_s)
 
 
 async def eventually(condition: Callable[[], object]) -> None:

@@ -34,6 +34,7 @@ from vram_arbiter.schemas.errors import ConfigError, NoGpu
 from vram_arbiter.schemas.manifest import load_manifest
 from vram_arbiter.sidecars.images import header
 from vram_arbiter.sidecars.settings import read_footprints
+from vram_arbiter.testing.gpu import FakeGpu
 
 RATE_HZ = 200.0
 PR_SET_CHILD_SUBREAPER = 36
@@ -245,12 +246,6 @@ def recorded(record: Record, *command: str) -> int:
         ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)  # orphans of other tests
 
 
-def hide(fake_folder: Path) -> None:
-    config = fakegpu.parse_config((fake_folder / fakegpu.GPU_FILE).read_text())
-    hidden = config.model_copy(update={"faults": fakegpu.Faults(hide_processes=True)})
-    (fake_folder / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(hidden))
-
-
 @pytest.mark.e2e
 @pytest.mark.parametrize("listed", [True, False], ids=["listed", "hidden"])
 def test_a_program_under_observation(
@@ -258,7 +253,7 @@ def test_a_program_under_observation(
 ) -> None:
     """Its bytes are those of its tree, also when a parent in it has ended."""
     if not listed:
-        hide(fake_folder)
+        FakeGpu(fake_folder).edit(hide_processes=True)
     record = Record(gpu, RATE_HZ)
     assert recorded(record, sys.executable, "-c", ADOPTED, PROGRAM, str(readings)) == 0
     assert record.listed is listed
@@ -297,9 +292,7 @@ detector: {labels: [cube]}
 @pytest.mark.heavy
 def test_a_model_in_a_sidecar_of_its_own(gpu: Gpu, readings: Path, fake_folder: Path) -> None:
     """Its load peak is seen although it is freed at once: memory comes back later."""
-    config = fakegpu.parse_config((fake_folder / fakegpu.GPU_FILE).read_text())
-    slow = config.model_copy(update={"release_lag_s": 0.3})
-    (fake_folder / fakegpu.GPU_FILE).write_text(fakegpu.dump_config(slow))
+    FakeGpu(fake_folder).edit(release_lag_s=0.3)
     (readings / "rskill.yaml").write_text(MANIFEST)
     sidecar = [
         sys.executable, f"{ROOT}/tests/sidecars/echo_sidecar.py", str(readings),

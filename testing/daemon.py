@@ -1,0 +1,141 @@
+"""A private daemon: `python -m vram_arbiter.arbiter` in a folder of its own, started until READY,
+ended by its pid."""
+
+import os
+import select
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import IO, Final, Self
+
+from vram_arbiter.testing.waiting import POLL_S, eventually
+
+START_S: Final = 60.0
+STOP_S: Final = 60.0
+PROGRAM: Final = (sys.executable, "-m", "vram_arbiter.arbiter")
+FOREIGN: Final = ("VRAM_ARBITER_", "WATCHDOG_", "OTEL_")
+"""Variables with which a program would find another daemon or collector."""
+
+
+class ArbiterProcess:
+    """One runtime folder with at most one daemon in it at a time; it can be killed and started
+    again on the same state.
+
+    The folder `runtime` is short (a socket path holds 107 bytes) and holds `arbiter.sock`,
+    `state/`, `arbiter.log` and the simulated GPU `fakegpu/` (`gpu_folder`; of several the first).
+    `environ` is what clients need to find it.
+    """
+
+    def __init__(
+        self, gpu: str = "fake:8GiB", arguments: Sequence[str] = (), config: str | None = None
+    ) -> None:
+        """`gpu` and `arguments` as of `vram-arbiter`; `config`: text of an arbiter.yaml."""
+        self.runtime = Path(tempfile.mkdtemp(prefix="va"))
+        self.endpoint = f"ipc://{self.runtime}/arbiter.sock"
+        self.state = self.runtime / "state"
+        self.gpu_folder = self.runtime / "fakegpu"
+        self.gpu = gpu
+        self.arguments = list(arguments)
+        if config is not None:
+            (self.runtime / "arbiter.yaml").write_text(config)
+            self.arguments += ["--config", str(self.runtime / "arbiter.yaml")]
+        (self.runtime / "arbiter.log").touch()
+        self.process: subprocess.Popen[bytes] | None = None
+        self.messages: list[str] = []
+        self.program = list(PROGRAM)
+        self._notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        self._notify.bind(str(self.runtime / "notify.sock"))
+
+    @property
+    def log(self) -> str:
+        return (self.runtime / "arbiter.log").read_text(errors="replace")
+
+    @property
+    def pid(self) -> int:
+        assert self.process is not None, "not started"
+        return self.process.pid
+
+    @property
+    def environ(self) -> dict[str, str]:
+        kept = {key: value for key, value in os.environ.items() if not key.startswith(FOREIGN)}
+        return kept | {"VRAM_ARBITER_RUNTIME": str(self.runtime), "PYTHONUNBUFFERED": "1"}
+
+    def command(self) -> list[str]:
+        given = ["--gpu", self.gpu, "--state-dir", str(self.state)]
+        return [*self.program, *given, *self.arguments]
+
+    def spawn(self, extra_environ: Mapping[str, str] | None = None) -> subprocess.Popen[bytes]:
+        """Start the daemon without waiting for it."""
+        assert self.process is None or self.process.poll() is not None, "already running"
+        notify = {"NOTIFY_SOCKET": str(self.runtime / "notify.sock")}
+        with (self.runtime / "arbiter.log").open("ab") as log:
+            self.process = self._launch(self.environ | notify | dict(extra_environ or {}), log)
+        return self.process
+
+    def _launch(self, environ: Mapping[str, str], log: IO[bytes]) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            self.command(), env=environ, stdout=log, stderr=log, stdin=subprocess.DEVNULL
+        )
+
+    def start(self, extra_environ: Mapping[str, str] | None = None) -> Self:
+        """Start the daemon and wait until it says READY. Raises RuntimeError with its log if it
+        ends or stays silent."""
+        self.spawn(extra_environ)
+        self.wait_for("READY=1", START_S)
+        return self
+
+    def wait_for(self, word: str, timeout_s: float) -> str:
+        """Wait for a notification that holds `word`. Raises RuntimeError."""
+        assert self.process is not None
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            ended = self.process.poll()  # first: what it said before its end is still read
+            if select.select([self._notify], [], [], POLL_S)[0]:
+                if word in self._heard():
+                    return self.messages[-1]
+            elif ended is not None:
+                raise RuntimeError(f"the arbiter ended with {ended}:\n{self.log}")
+        raise RuntimeError(f"no {word} from the arbiter within {timeout_s} s:\n{self.log}")
+
+    def _heard(self) -> str:
+        self.messages.append(self._notify.recv(4096).decode())
+        return self.messages[-1]
+
+    def _put_aside(self) -> None:
+        """Read what the daemon has told by now: the kernel keeps no more than ten messages, and
+        drops the rest."""
+        while select.select([self._notify], [], [], 0)[0]:
+            self._heard()
+
+    def stop(self) -> int:
+        """SIGTERM, and its exit code."""
+        return self._end(signal.SIGTERM)
+
+    def kill(self) -> int:
+        """SIGKILL."""
+        return self._end(signal.SIGKILL)
+
+    def _end(self, number: signal.Signals) -> int:
+        assert self.process is not None
+        self._put_aside()
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        return self.process.wait(STOP_S)
+
+    def close(self) -> None:
+        """End the daemon if it runs and remove the folder."""
+        if self.process is not None and self.process.poll() is None:
+            self.kill()
+        self._notify.close()
+        eventually(self._removed)
+
+    def _removed(self) -> bool:
+        """Remove the folder; False where a program that is ending wrote to it meanwhile."""
+        shutil.rmtree(self.runtime, ignore_errors=True)
+        return not self.runtime.exists()

@@ -1,0 +1,29 @@
+"""Waiting for a condition that shows from outside."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+WITHIN_S: Final = 60.0
+"""Limit of a wait: a machine with other work takes its time, and only a failing test takes all."""
+POLL_S: Final = 0.01
+
+
+def eventually[T](condition: Callable[[], T], within_s: float = WITHIN_S) -> T:
+    """Poll `condition` until it returns a true value, and return that value.
+
+    An AssertionError that it raises counts as not yet. Raises AssertionError at the limit, with
+    what was seen last.
+    """
+    ends, pause = time.monotonic() + within_s, threading.Event()
+    while True:
+        try:
+            if found := condition():
+                return found
+            seen = repr(found)
+        except AssertionError as error:
+            seen = str(error)
+        if time.monotonic() >= ends:
+            raise AssertionError(f"not true within {within_s:g} s, last seen: {seen}")
+        pause.wait(POLL_S)
