@@ -77,7 +77,7 @@ class Consumer:
             ended = self.process.poll()
             if (found := self.state) == state:
                 return True
-            if ended is not None:
+            if ended is not None and state != GONE:
                 raise RuntimeError(
                     f"{self.name} ended with {ended} before its lease was {state}:\n{self.output}"
                 )

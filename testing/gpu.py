@@ -15,6 +15,7 @@ from typing import Final
 
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.errors import NoGpu
+from vram_arbiter.schemas.fakegpu import FOLDER_VARIABLE
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime import fakegpu_folder, procfs
 from vram_arbiter.schemas.sizes import parse_bytes
@@ -37,12 +38,12 @@ class FakeGpu:
     """
 
     def __init__(self, folder: Path | None = None, name: str = "test") -> None:
-        self.folder = folder or Path(os.environ.get(fakegpu.FOLDER_VARIABLE, "/nonexistent"))
+        self.folder = folder or Path(os.environ.get(FOLDER_VARIABLE, f"${FOLDER_VARIABLE}"))
         self._name = name
         if not (self.folder / fakegpu.GPU_FILE).exists():
             raise NoGpu(
                 f"no simulated GPU in {self.folder}",
-                hint=f"start the arbiter with --gpu fake:8GiB, and set {fakegpu.FOLDER_VARIABLE}",
+                hint=f"start the arbiter with --gpu fake:8GiB, and set {FOLDER_VARIABLE}",
             )
 
     @property

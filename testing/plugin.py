@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from vram_arbiter.testing.gpu import FakeGpu
     from vram_arbiter.testing.timeline import Timeline
 
+type Make = Callable[..., ArbiterProcess]
+type Start = Callable[..., Consumer]
 MARKER = "gpu_budget"
 _SHOWN = pytest.StashKey[list[tuple[str, Callable[[], str]]]]()
 """Sections of the report of a failed test: title, and what makes its text."""
@@ -43,8 +45,15 @@ def pytest_runtest_makereport(
     """Add the timelines and outputs to the report of a failed test."""
     report = yield
     if report.failed and report.when != "teardown":
-        report.sections += [(title, text()) for title, text in item.stash.get(_SHOWN, ())]
+        report.sections += [(title, _read(text)) for title, text in item.stash.get(_SHOWN, ())]
     return report
+
+
+def _read(text: Callable[[], str]) -> str:
+    try:
+        return text()
+    except (OSError, ValueError) as error:  # the test itself closed the daemon or the consumer
+        return f"cannot be read: {error}"
 
 
 def _show(request: pytest.FixtureRequest, title: str, text: Callable[[], str]) -> None:
@@ -52,7 +61,7 @@ def _show(request: pytest.FixtureRequest, title: str, text: Callable[[], str]) -
 
 
 @pytest.fixture(scope="session")
-def arbiter_process() -> "Callable[..., ArbiterProcess]":
+def arbiter_process() -> Make:
     """What makes the daemons of `make_arbiter`; override it to start them in another way."""
     from vram_arbiter.testing.daemon import ArbiterProcess
 
@@ -60,9 +69,7 @@ def arbiter_process() -> "Callable[..., ArbiterProcess]":
 
 
 @pytest.fixture
-def make_arbiter(
-    request: pytest.FixtureRequest, arbiter_process: "Callable[..., ArbiterProcess]"
-) -> "Iterator[Callable[..., ArbiterProcess]]":
+def make_arbiter(request: pytest.FixtureRequest, arbiter_process: Make) -> Iterator[Make]:
     """`make_arbiter(gpu="fake:8GiB", arguments=(), config=None)` prepares a daemon; call `.start()`
     on it. Ended at teardown."""
     from vram_arbiter.testing.timeline import Timeline
@@ -82,9 +89,7 @@ def make_arbiter(
 
 
 @pytest.fixture
-def arbiter(
-    request: pytest.FixtureRequest, make_arbiter: "Callable[..., ArbiterProcess]"
-) -> "ArbiterProcess":
+def arbiter(request: pytest.FixtureRequest, make_arbiter: Make) -> "ArbiterProcess":
     """A running daemon with the simulated GPU of marker `gpu_budget`."""
     from vram_arbiter.schemas.sizes import parse_bytes
     from vram_arbiter.testing.gpu import FakeGpu, parse_lag
@@ -110,9 +115,7 @@ def fake_gpu(arbiter: "ArbiterProcess") -> "FakeGpu":
 
 
 @pytest.fixture
-def consumer(
-    request: pytest.FixtureRequest, arbiter: "ArbiterProcess"
-) -> "Iterator[Callable[..., Consumer]]":
+def consumer(request: pytest.FixtureRequest, arbiter: "ArbiterProcess") -> Iterator[Start]:
     """`consumer(name, program, *arguments)` starts a command, or a function of the test's file, in
     a process of its own. Ended at teardown."""
     from vram_arbiter.testing.consumer import Consumer

@@ -170,13 +170,8 @@ class _Player:
         eventually(heard, self.scenario.within_s)
 
     def expect(self, states: Mapping[str, str]) -> None:
-        def there() -> bool:
-            found = {name: self.consumers[name].state for name in states}
-            if found != states:
-                raise AssertionError(str(found))
-            return True
-
-        eventually(there, self.scenario.within_s)
+        for name, state in states.items():
+            self.consumers[name].reached(state, self.scenario.within_s)
 
 
 _ACTIONS: Final[Mapping[str, Callable[[_Player, Any], object]]] = {

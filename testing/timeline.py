@@ -8,9 +8,10 @@ import contextlib
 import json
 import time
 from collections.abc import Iterator, Sequence
+from operator import itemgetter
 from typing import Final
 
-from vram_arbiter.clients.cli.history import PAGE, page
+from vram_arbiter.clients.cli.history import NEVER, Wanted, collect
 from vram_arbiter.clients.cli.text import event_line
 from vram_arbiter.schemas.errors import VramError, from_wire
 from vram_arbiter.schemas.fakegpu import LOG_FILE
@@ -31,14 +32,10 @@ class Timeline:
     def events(self, *kinds: str, consumer: str | None = None) -> Sequence[JsonMap]:
         """Return the events of these kinds, by default all, in their order. Raises
         ArbiterUnreachable."""
-        found: list[JsonMap] = []
-        while True:
-            reply = page(int(found[-1]["seq"]) if found else 0, PAGE, kinds, self._arbiter.endpoint)
-            if not reply.get("ok"):
-                raise from_wire(reply["error"])
-            found += reply["events"]
-            if len(reply["events"]) < PAGE:
-                return [one for one in found if consumer in (None, one.get("consumer"))]
+        reply = collect(Wanted(kinds, limit=NEVER, after=0), self._arbiter.endpoint)
+        if not reply.get("ok"):
+            raise from_wire(reply["error"])
+        return [one for one in reply["events"] if consumer in (None, one.get("consumer"))]
 
     def text(self) -> str:
         """Return history and allocation logs as lines, in the order of time."""
@@ -49,12 +46,12 @@ class Timeline:
         except VramError as error:
             lines.append((0.0, f"no history: {error}"))
         for where, one in self._log_lines():
-            used = f"{format_bytes(one['used_after'])} of {format_bytes(one['capacity'])}"
+            size, used = format_bytes(one["bytes"]), format_bytes(one["used_after"])
             told = (
-                f"{where}  {one['op']} {format_bytes(one['bytes'])} by {one['name']} ({one['pid']})"
+                f"{where}  {one['op']} {size} by {one['name']} ({one['pid']}), then {used} in use"
             )
-            lines.append((one["t"] + wall_minus_monotonic_s, f"{told}, then {used}"))
-        return "\n".join(line for _, line in sorted(lines))
+            lines.append((one["t"] + wall_minus_monotonic_s, told))
+        return "\n".join(line for _, line in sorted(lines, key=itemgetter(0)))
 
     # -- assertions
     def no_overcommit(self) -> None:
@@ -107,6 +104,4 @@ def _line(event: JsonMap) -> str:
 
 def _disproved(problem: str, events: Sequence[JsonMap]) -> AssertionError:
     """Not an assert statement: pytest would reword it where it rewrites this module."""
-    return AssertionError(
-        "\n".join([problem, *map(_line, events)] + ["no such event"] * (not events))
-    )
+    return AssertionError("\n".join([problem, *map(_line, events)]))

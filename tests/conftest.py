@@ -45,6 +45,7 @@ LONGEST = (
     "tests/e2e/",
     "tests/sidecars/",
     "tests/packaging/",
+    "tests/testing/",
     "tests/runner/sensors/test_gstreamer.py",
     "tests/runner/skills/test_policies_as_lerobot.py",
     "tests/runner/robots/test_lerobot_robot.py",

@@ -37,20 +37,14 @@ class Service(ArbiterProcess):
 
     def __init__(self, options: str, group: str) -> None:
         super().__init__(prepared=True)
+        self.endpoint = f"ipc://{self.runtime}/run/arbiter.sock"
+        self.gpu_folder = self.runtime / "run" / "fakegpu"
         self.options = options
         self.group = group
         self.wrapper: list[str] = []
         for name, mode in (("run", 0o1770), ("lib", 0o700), ("etc", 0o755)):
             (self.runtime / name).mkdir()
             (self.runtime / name).chmod(mode)  # whatever the umask is
-
-    @property
-    def endpoint(self) -> str:
-        return f"ipc://{self.runtime}/run/arbiter.sock"
-
-    @property
-    def gpu_folder(self) -> Path:
-        return self.runtime / "run" / "fakegpu"
 
     @property
     def environ(self) -> dict[str, str]:

@@ -1,5 +1,5 @@
-"""The wheel holds the product and its data: no test of ours, no training code. It is built from what the
-images copy, and installed as they do."""
+"""The wheel holds the product and its data: no test of ours, no training code. It is built from
+what the images copy, and installed as they do."""
 
 import os
 import shlex

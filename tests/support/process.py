@@ -1,4 +1,4 @@
-"""A real daemon and `vramctl` for our own tests, forked from interpreters that have imported them."""
+"""A daemon and `vramctl` for our own tests, forked from interpreters that have imported them."""
 
 import os
 import select

@@ -18,7 +18,7 @@ import os
 
 import pytest
 from vram_arbiter import Client
-from vram_arbiter.testing import hold
+from vram_arbiter.testing.stand_in import hold
 
 def note(*pids):
     with open(os.environ["PIDS"], "a") as file:
@@ -49,6 +49,11 @@ def test_failing(arbiter, consumer, timeline):
     note(arbiter.pid, detector.pid)
     detector.reached("held")
     timeline.evicted_once("detector")
+
+def test_failing_after_the_end(arbiter, consumer):
+    consumer("short", ["true"]).close()
+    arbiter.close()
+    assert False
 """
 
 
@@ -86,7 +91,7 @@ def test_reports_and_leftovers(tmp_path: Path) -> None:
     (suite / "pytest.ini").write_text("[pytest]\naddopts = --strict-markers\n")
     done = pytest_at(suite, PIDS=str(pids))
     said = done.stdout
-    assert "1 failed, 1 passed, 3 errors" in said, said + done.stderr
+    assert "2 failed, 1 passed, 3 errors" in said, said + done.stderr
     for problem in (
         "@pytest.mark.gpu_budget: not a size: '8 bananas'; write bytes or 8GiB",
         "@pytest.mark.gpu_budget: GpuBudget.__new__() got an unexpected keyword argument 'delay'",
@@ -96,6 +101,8 @@ def test_reports_and_leftovers(tmp_path: Path) -> None:
         "alloc 5 GiB by detector",
         "- log of the arbiter -",
         "- output of detector -",
+        "no history: ",
+        "cannot be read: ",
     ):
         assert problem in said
     assert list((tmp_path / "t").glob("va*")) == []

@@ -73,5 +73,7 @@ def test_the_example_of_the_help_passes_and_a_wrong_expectation_fails(tmp_path: 
     assert "revoke_asked" in passed
     assert "alloc 5 GiB by detector" in passed
     assert "alloc 6 GiB by stowaway" in failed
-    said = "step 3, expect: {'policy': 'held'}: not true within 0.5 s, last seen: {'policy': '"
+    said = (
+        "step 3, expect: {'policy': 'held'}: not true within 0.5 s, last seen: the lease of policy"
+    )
     assert f"{wrong}: {said}" in failed

@@ -2,7 +2,7 @@
 
 import pytest
 
-from vram_arbiter.testing import eventually
+from vram_arbiter.testing.waiting import eventually
 
 
 def test_the_true_value_is_returned() -> None:

@@ -5,7 +5,8 @@ import sys
 import pytest
 from bin_picker.detector import Model, serve
 
-from vram_arbiter.testing import FakeGpu, hold
+from vram_arbiter.testing.gpu import FakeGpu
+from vram_arbiter.testing.stand_in import hold
 
 pytestmark = pytest.mark.gpu_budget("8GiB", lag="100ms")
 

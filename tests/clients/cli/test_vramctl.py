@@ -72,7 +72,7 @@ COMMANDS = {
     ),
     "runner": ("", "sim", "deploy", "estop"),
     "arbiter": ("",), "arbiter.offline": ("replay",), "sidecars": ("",), "reasoner": ("",),
-    "schemas": ("", "check"),
+    "schemas": ("", "check"), "testing": ("",),
 }  # fmt: skip
 RUN_EACH = """
 import contextlib, io, json, runpy, sys
