@@ -23,6 +23,10 @@ RETURNS = kind("returns", 5 * GIB, standby=True)
 STAYS = kind("stays", 3 * GIB, evictable=False)
 TALKS = kind("talks", 5 * GIB, ttl_s=12.0)
 TALKS_BACK = kind("talks back", 5 * GIB, ttl_s=12.0, standby=True)
+HELD = "acquire a, send a, hear a, load a, ready a, send a, hear a"
+REVOKED = f"{HELD}, acquire b, send b"
+"""One client holds, another one waits, and neither has heard of it."""
+EVICTED = "acquire a, load a, ready a, read GPU-0, acquire b"
 FAULTS = {"crash": 1, "restart": 1, "late": 1, "fail": 1, "cancel": 1, "lie": 1}
 
 SCENARIOS: Mapping[str, Scenario] = {
@@ -41,9 +45,23 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario("talk-turns", (TALKS, TALKS), faults={"drop": 1}, talks=True),
         Scenario("talk-restart", (TALKS, TALKS), faults={"restart": 1, "late": 1}, talks=True),
         Scenario("talk-cancel", (TALKS, TALKS), faults={"cancel": 1, "drop": 1}, talks=True),
-        Scenario("talk-timeout", (TALKS, TALKS), 1, 1, 3.0, {"drop": 1}, talks=True),
+        Scenario(
+            "talk-timeout", (TALKS, TALKS), wait_timeout_s=3.0, faults={"drop": 1}, talks=True
+        ),
         Scenario("talk-standby", (TALKS_BACK, TALKS), faults={"drop": 1}, talks=True),
         Scenario("talk-crash", (TALKS, TALKS), faults={"crash": 1, "restart": 1}, talks=True),
+        Scenario("revoked", (TALKS, TALKS), after=REVOKED, faults={"drop": 1}, talks=True),
+        Scenario(
+            "revoked-restart", (TALKS, TALKS), after=REVOKED, faults={"restart": 1}, talks=True
+        ),
+        Scenario(
+            "revoked-cancel",
+            (TALKS_BACK, TALKS),
+            after=REVOKED,
+            faults={"cancel": 1, "drop": 1},
+            talks=True,
+        ),
+        Scenario("evicted", (BIG, PEAKY), after=EVICTED, lags=True, faults=FAULTS),
         Scenario("three", (BIG, BIG, BIG)),
         Scenario("kinds", (BIG, PEAKY, ALONE), faults={"crash": 1}),
         Scenario("two-gpus", (BIG, BIG, BIG), gpus=2),

@@ -55,6 +55,12 @@ type Action = tuple[str, str]
 """(verb, whose): the name of a client, a process or a GPU; ""."""
 
 
+def story(text: str) -> list[Action]:
+    """Return `acquire a, load a, tick` as actions."""
+    steps = [step.partition(" ") for step in text.split(", ") if step]
+    return [(verb, whose) for verb, _, whose in steps]
+
+
 @dataclass(frozen=True, slots=True)
 class Scenario:
     """What a world is made of.
@@ -62,7 +68,8 @@ class Scenario:
     Args:
         clients: The spec of each client's lease.
         acquires: How often each client asks.
-        faults: How often these verbs may happen in one story.
+        after: What has happened already, as `acquire a, load a`.
+        faults: How often these verbs may happen in one story from then on.
         lags: Whether the driver returns memory late.
         talks: Whether messages are under way until they are sent and heard, and readings come at
             once; else it is the other way round.
@@ -72,6 +79,7 @@ class Scenario:
     clients: tuple[LeaseSpec, ...]
     gpus: int = 1
     acquires: int = 1
+    after: str = ""
     wait_timeout_s: float | None = None
     faults: Mapping[str, int] = field(default_factory=dict)
     lags: bool = False
@@ -148,6 +156,8 @@ class World:
         for client in self.clients.values():
             client.act("connect", self)
             self._deliver(mail=True, readings=True)
+        for action in story(scenario.after):
+            self.act(action)
 
     # -- what may happen
     def actions(self) -> list[Action]:
