@@ -6,7 +6,7 @@ import pytest
 from tests.explore.client import Broken
 from tests.explore.cloning import freeze, thaw
 from tests.explore.fingerprint import canonical, fingerprint
-from tests.explore.scenarios import BIG, TALKS, kind
+from tests.explore.scenarios import BIG, HELD, TALKS, kind
 from tests.explore.search import Search, play
 from tests.explore.world import CAPACITY_BYTES, OVERHEAD_BYTES, STEP_S, Scenario, story
 from vram_arbiter.arbiter.core.arbiter import Arbiter
@@ -145,6 +145,12 @@ def test_the_order_of_independent_events_makes_no_difference(
         pytest.param(TALK, "acquire a", "acquire a, send a", id="a message under way"),
         pytest.param(TALK, "acquire a, send a", "acquire a, send a, hear a", id="one heard"),
         pytest.param(TALK, "acquire a", "drop a, acquire a", id="a connection"),
+        pytest.param(
+            TALK,
+            f"{HELD}, use a, drop a",
+            f"{HELD}, leave a, drop a",
+            id="what is sent again",
+        ),
     ],
 )
 def test_worlds_that_a_client_can_tell_apart_are_two(
