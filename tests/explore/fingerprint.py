@@ -186,6 +186,8 @@ def _client(core: Core, client: Client, names: Names) -> _Part:
 def _message(part: _Part, client: Client, message: Mapping[str, Any]) -> None:
     """A message without its numbers and times."""
     for key, value in sorted(message.items()):
+        if key in _NOISE or isinstance(value, float):
+            continue
         if key in ("id", "re"):
             part.put(part.name((client.process, value)))
         elif key == "token" and value is not None:
@@ -193,7 +195,7 @@ def _message(part: _Part, client: Client, message: Mapping[str, Any]) -> None:
         elif isinstance(value, dict | list):
             for one in value if isinstance(value, list) else [value]:
                 _message(part, client, one if isinstance(one, dict) else {"": one})
-        elif not isinstance(value, float) and key not in _NOISE:
+        else:
             part.put(key, value)
 
 

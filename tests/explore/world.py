@@ -33,6 +33,8 @@ CAPACITY_BYTES, OVERHEAD_BYTES = 8 * d.GIB, 100 * d.MIB
 START_S, STEP_S = 1024.0, 2.0**-20
 FOR_EVER_S, FAR_S = 3600.0, 600.0
 """The longest time to live; what is due so much later is not waited for."""
+LAG_S = 1.5
+"""The longest time in which a driver returns memory."""
 SLEEP_EVENTS_MAX = 1000
 QUICK: Mapping[str, Any] = {
     "ageing_s_per_point": 1e6,
@@ -96,14 +98,17 @@ class Device:
     lists: bool
     held: dict[ProcessKey, int] = field(default_factory=dict)
     late: dict[ProcessKey, int] = field(default_factory=dict)  # given up, and shown all the same
+    freed_at: float = 0.0  # the last of that
     reading: ev.MemorySampled | None = None
     again: bool = False  # a question came after the reading began
 
-    def set(self, process: ProcessKey, count: int, *, lags: bool) -> None:
-        """A process holds so many bytes from now on."""
+    def set(self, process: ProcessKey, count: int, freed_at: float | None) -> None:
+        """A process holds so many bytes from now on. `freed_at`: when it gave up the others, if the
+        driver does not return them at once."""
         freed = self.held.pop(process, 0) - count
-        if lags and freed > 0:
+        if freed_at is not None and freed > 0:
             self.late[process] = self.late.get(process, 0) + freed
+            self.freed_at = freed_at
         if count:
             self.held[process] = count
 
@@ -231,10 +236,14 @@ class World:
         if client is not None and client.client == to:
             client.tell(told, re, self.epoch)
 
+    def hold(self, process: ProcessKey, gpu: GpuId, count: int) -> None:
+        """A process holds so many bytes on a GPU from now on."""
+        self.devices[gpu].set(process, count, self.now if self.scenario.lags else None)
+
     def kill(self, process: ProcessKey) -> None:
         """A process dies: its bytes go, and the daemon will hear of it."""
-        for device in self.devices.values():
-            device.set(process, 0, lags=self.scenario.lags)
+        for gpu in self.devices:
+            self.hold(process, gpu, 0)
         self.dead.add(process)
         self.unheard.append(process)
 
@@ -319,6 +328,9 @@ class World:
         at = self._next_at()
         assert at is not None
         self.now = max(self.now, at)
+        for device in self.devices.values():
+            if self.now > device.freed_at + LAG_S:
+                device.late.clear()
         for client in self.clients.values():
             client.tick(self.now)
         due = self.engine.next_deadline()
