@@ -142,8 +142,7 @@ class Client:
 
     def _hold(self, world: "World", count: int) -> None:
         self.bytes = count
-        device = world.devices[GpuId(str(self._record.view.gpu))]
-        device.set(self.process, count, lags=world.scenario.lags)
+        world.hold(self.process, GpuId(str(self._record.view.gpu)), count)
 
     # -- its connection, and the daemon's session at the other end
     def do_connect(self, world: "World") -> None:

@@ -45,7 +45,7 @@ _LEFT_OUT_BECAUSE: Mapping[str, str] = {
     "it is learned, or told alone": "grew_at drifted reading_s evicted charge_bytes held_from"
     " unloading_at released_at verdict_at wait_timeout_s",
     "it is of the protocol, and never changes": "foreign_uses _above _hello _connection _holdings"
-    " instance epoch heartbeat_s grace_s view ttl_s wanted_by deadline_in_s priority lists",
+    " instance epoch heartbeat_s grace_s view ttl_s deadline_in_s priority lists",
     "it is of the protocol, and an order of messages": "connections lives protocol up down record"
     " awaited _ids outgoing events _pending _handshake_id _handshake_at _heard_at reacquire_id"
     " request_id renewed_at deadline on_reply on_error",
@@ -161,7 +161,7 @@ def _record_writer() -> _Writer:
         if not getters:
             every = [one.name for one in fields(value)] if is_dataclass(value) else vars(value)
             names = [name for name in every if name not in LEFT_OUT]
-            getters.append(attrgetter(*names, *names[:1]))  # a tuple, also of a single one
+            getters.append(attrgetter(*names, *names[:1]) if names else lambda _: ())
         part.put(*getters[0](value))
 
     return write
@@ -171,8 +171,11 @@ def _record_writer() -> _Writer:
 def _client(core: Core, client: Client, names: Names) -> _Part:
     part, connection = _Part(names), client.protocol.connection
     part.put(client.spec, client, client.record is None, client.protocol)
-    for number in (client.awaited, connection._handshake_id, *connection._pending):
-        part.put(part.name((client.process, number)), connection._pending.get(number))
+    for number in (client.awaited, connection._handshake_id):
+        part.put(part.name((client.process, number)))
+    for number, pending in connection._pending.items():
+        part.put(part.name((client.process, number)), pending)
+        part.put(pending.request.TAG[1], pending.request)
     for message in (*client.up, {"": ""}, *client.down):
         _message(part, client, message)
     mine = {id: nonce for (process, nonce), id in core.nonces.items() if process == client.process}
@@ -183,6 +186,8 @@ def _client(core: Core, client: Client, names: Names) -> _Part:
 def _message(part: _Part, client: Client, message: Mapping[str, Any]) -> None:
     """A message without its numbers and times."""
     for key, value in sorted(message.items()):
+        if key in _NOISE or isinstance(value, float):
+            continue
         if key in ("id", "re"):
             part.put(part.name((client.process, value)))
         elif key == "token" and value is not None:
@@ -190,7 +195,7 @@ def _message(part: _Part, client: Client, message: Mapping[str, Any]) -> None:
         elif isinstance(value, dict | list):
             for one in value if isinstance(value, list) else [value]:
                 _message(part, client, one if isinstance(one, dict) else {"": one})
-        elif not isinstance(value, float) and key not in _NOISE:
+        else:
             part.put(key, value)
 
 

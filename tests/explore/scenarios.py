@@ -15,16 +15,19 @@ def kind(name: str, peak: int, steady: int = 0, residue: int = 0, **spec: Any) -
     return LeaseSpec(consumer=name, model_id=name, footprint=sizes, **(usual | spec))
 
 
-BIG, SMALL = kind("big", 5 * GIB), kind("small", 3 * GIB)
+BIG, HALF = kind("big", 5 * GIB), kind("half", 3 * GIB)
 PEAKY = kind("peaky", 6 * GIB, 3 * GIB, 450 * MIB)
 URGENT = kind("urgent", 5 * GIB, priority=60)
 ALONE = kind("alone", 3 * GIB, mode="exclusive")
 RETURNS = kind("returns", 5 * GIB, standby=True)
 STAYS = kind("stays", 3 * GIB, evictable=False)
 TALKS = kind("talks", 5 * GIB, ttl_s=12.0)
-TALKS_BACK = kind("talks back", 5 * GIB, ttl_s=12.0, standby=True)
-FAULTS = {"crash": 1, "restart": 1, "late": 1, "fail": 1, "cancel": 1, "lie": 1}
-
+BACK = kind("talks back", 5 * GIB, ttl_s=12.0, standby=True)
+EVERYTHING = {"crash": 1, "restart": 1, "late": 1, "fail": 1, "cancel": 1, "lie": 1}
+HELD = "acquire a, send a, hear a, load a, ready a, send a, hear a"
+REVOKED = f"{HELD}, acquire b, send b"
+"""One client holds, another one waits, and neither has heard of it."""
+EVICTED = "acquire a, load a, ready a, read GPU-0, acquire b"
 SCENARIOS: Mapping[str, Scenario] = {
     one.name: one
     for one in (
@@ -32,22 +35,30 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario("timeout", (BIG, BIG), wait_timeout_s=3.0),
         Scenario("cancel", (BIG, BIG), acquires=2, faults={"cancel": 1}),
         Scenario("stays", (STAYS, ALONE), faults={"cancel": 1}),
-        Scenario("readings", (BIG, BIG), faults={"late": 1, "fail": 1, "lie": 1}),
         Scenario("standby", (RETURNS, BIG), acquires=2),
-        Scenario("crash", (BIG, PEAKY), faults={"crash": 1, "late": 1}, lags=True),
         Scenario("restart", (BIG, PEAKY), faults={"restart": 1, "crash": 1}),
-        Scenario("blind", (BIG, PEAKY), faults={"fail": 1}, lists=False, lags=True),
+        Scenario("readings", (BIG, BIG), faults={"late": 1, "fail": 1, "lie": 1}),
+        *(
+            Scenario(f"evicted-{fault}", (BIG, PEAKY), 1, 2, EVICTED, faults={fault: 1}, lags=True)
+            for fault in ("crash", "late", "fail", "lie", "restart", "cancel")
+        ),
+        Scenario("blind", (HALF, HALF), acquires=2, lists=False, lags=True),
         Scenario("talk", (TALKS,), faults={"drop": 2}, talks=True),
         Scenario("talk-turns", (TALKS, TALKS), faults={"drop": 1}, talks=True),
         Scenario("talk-restart", (TALKS, TALKS), faults={"restart": 1, "late": 1}, talks=True),
-        Scenario("talk-cancel", (TALKS, TALKS), faults={"cancel": 1, "drop": 1}, talks=True),
-        Scenario("talk-timeout", (TALKS, TALKS), 1, 1, 3.0, {"drop": 1}, talks=True),
-        Scenario("talk-standby", (TALKS_BACK, TALKS), faults={"drop": 1}, talks=True),
-        Scenario("talk-crash", (TALKS, TALKS), faults={"crash": 1, "restart": 1}, talks=True),
+        Scenario(
+            "talk-timeout", (TALKS, TALKS), wait_timeout_s=3.0, faults={"drop": 1}, talks=True
+        ),
+        *(
+            Scenario(
+                f"revoked-{fault}", (BACK, TALKS), 1, 1, REVOKED, faults={fault: 1}, talks=True
+            )
+            for fault in ("drop", "cancel", "crash", "restart")
+        ),
         Scenario("three", (BIG, BIG, BIG)),
         Scenario("kinds", (BIG, PEAKY, ALONE), faults={"crash": 1}),
         Scenario("two-gpus", (BIG, BIG, BIG), gpus=2),
-        Scenario("placed", (BIG, URGENT, SMALL), gpus=2, faults={"crash": 1, "cancel": 1}),
-        Scenario("everything", (BIG, PEAKY, URGENT), gpus=2, acquires=2, faults=FAULTS),
+        Scenario("placed", (BIG, URGENT, HALF), gpus=2, faults={"crash": 1, "cancel": 1}),
+        Scenario("everything", (BIG, PEAKY, URGENT), gpus=2, acquires=2, faults=EVERYTHING),
     )
 }

@@ -6,9 +6,9 @@ import pytest
 from tests.explore.client import Broken
 from tests.explore.cloning import freeze, thaw
 from tests.explore.fingerprint import canonical, fingerprint
-from tests.explore.scenarios import BIG, TALKS, kind
+from tests.explore.scenarios import BIG, HELD, TALKS, kind
 from tests.explore.search import Search, play
-from tests.explore.world import CAPACITY_BYTES, OVERHEAD_BYTES, STEP_S, Action, Scenario
+from tests.explore.world import CAPACITY_BYTES, OVERHEAD_BYTES, STEP_S, Scenario, story
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
 from vram_arbiter.arbiter.core.events import Asked, Event, MemorySampled, ProbeFailed
@@ -19,12 +19,6 @@ ONE = Scenario("one", (BIG,))
 TWO = Scenario("two", (BIG, BIG), acquires=2)
 APART = Scenario("apart", (kind("left", GIB, gpu="0"), kind("right", GIB, gpu="1")), gpus=2)
 TALK = Scenario("talk", (TALKS, TALKS), talks=True, faults={"drop": 1})
-
-
-def story(text: str) -> list[Action]:
-    """Return `acquire a, load a, tick` as actions."""
-    steps = [step.split() for step in text.split(", ")] if text else []
-    return [(verb, whose[0] if whose else "") for verb, *whose in steps]
 
 
 class Credulous(Arbiter):
@@ -151,6 +145,12 @@ def test_the_order_of_independent_events_makes_no_difference(
         pytest.param(TALK, "acquire a", "acquire a, send a", id="a message under way"),
         pytest.param(TALK, "acquire a, send a", "acquire a, send a, hear a", id="one heard"),
         pytest.param(TALK, "acquire a", "drop a, acquire a", id="a connection"),
+        pytest.param(
+            TALK,
+            f"{HELD}, use a, drop a",
+            f"{HELD}, leave a, drop a",
+            id="what is sent again",
+        ),
     ],
 )
 def test_worlds_that_a_client_can_tell_apart_are_two(

@@ -33,6 +33,8 @@ CAPACITY_BYTES, OVERHEAD_BYTES = 8 * d.GIB, 100 * d.MIB
 START_S, STEP_S = 1024.0, 2.0**-20
 FOR_EVER_S, FAR_S = 3600.0, 600.0
 """The longest time to live; what is due so much later is not waited for."""
+LAG_S = 1.5
+"""The longest time in which a driver returns memory."""
 SLEEP_EVENTS_MAX = 1000
 QUICK: Mapping[str, Any] = {
     "ageing_s_per_point": 1e6,
@@ -55,6 +57,12 @@ type Action = tuple[str, str]
 """(verb, whose): the name of a client, a process or a GPU; ""."""
 
 
+def story(text: str) -> list[Action]:
+    """Return `acquire a, load a, tick` as actions."""
+    steps = [step.partition(" ") for step in text.split(", ") if step]
+    return [(verb, whose) for verb, _, whose in steps]
+
+
 @dataclass(frozen=True, slots=True)
 class Scenario:
     """What a world is made of.
@@ -62,7 +70,8 @@ class Scenario:
     Args:
         clients: The spec of each client's lease.
         acquires: How often each client asks.
-        faults: How often these verbs may happen in one story.
+        after: What has happened already, as `acquire a, load a`.
+        faults: How often these verbs may happen in one story from then on.
         lags: Whether the driver returns memory late.
         talks: Whether messages are under way until they are sent and heard, and readings come at
             once; else it is the other way round.
@@ -72,6 +81,7 @@ class Scenario:
     clients: tuple[LeaseSpec, ...]
     gpus: int = 1
     acquires: int = 1
+    after: str = ""
     wait_timeout_s: float | None = None
     faults: Mapping[str, int] = field(default_factory=dict)
     lags: bool = False
@@ -88,14 +98,17 @@ class Device:
     lists: bool
     held: dict[ProcessKey, int] = field(default_factory=dict)
     late: dict[ProcessKey, int] = field(default_factory=dict)  # given up, and shown all the same
+    freed_at: float = 0.0  # the last of that
     reading: ev.MemorySampled | None = None
     again: bool = False  # a question came after the reading began
 
-    def set(self, process: ProcessKey, count: int, *, lags: bool) -> None:
-        """A process holds so many bytes from now on."""
+    def set(self, process: ProcessKey, count: int, freed_at: float | None) -> None:
+        """A process holds so many bytes from now on. `freed_at`: when it gave up the others, if the
+        driver does not return them at once."""
         freed = self.held.pop(process, 0) - count
-        if lags and freed > 0:
+        if freed_at is not None and freed > 0:
             self.late[process] = self.late.get(process, 0) + freed
+            self.freed_at = freed_at
         if count:
             self.held[process] = count
 
@@ -148,6 +161,8 @@ class World:
         for client in self.clients.values():
             client.act("connect", self)
             self._deliver(mail=True, readings=True)
+        for action in story(scenario.after):
+            self.act(action)
 
     # -- what may happen
     def actions(self) -> list[Action]:
@@ -221,10 +236,14 @@ class World:
         if client is not None and client.client == to:
             client.tell(told, re, self.epoch)
 
+    def hold(self, process: ProcessKey, gpu: GpuId, count: int) -> None:
+        """A process holds so many bytes on a GPU from now on."""
+        self.devices[gpu].set(process, count, self.now if self.scenario.lags else None)
+
     def kill(self, process: ProcessKey) -> None:
         """A process dies: its bytes go, and the daemon will hear of it."""
-        for device in self.devices.values():
-            device.set(process, 0, lags=self.scenario.lags)
+        for gpu in self.devices:
+            self.hold(process, gpu, 0)
         self.dead.add(process)
         self.unheard.append(process)
 
@@ -309,6 +328,9 @@ class World:
         at = self._next_at()
         assert at is not None
         self.now = max(self.now, at)
+        for device in self.devices.values():
+            if self.now > device.freed_at + LAG_S:
+                device.late.clear()
         for client in self.clients.values():
             client.tick(self.now)
         due = self.engine.next_deadline()
