@@ -241,7 +241,7 @@ class Client:
         """Return what a grant lets it put on a GPU beyond what it holds, whatever the engine says:
         until it knows that it has lost the lease."""
         record = self.record
-        if record is None or record.held or self.over or record.view.gpu != gpu:
+        if record is None or self.bytes or self.over or record.view.gpu != gpu:
             return 0
         return max(0, self.spec.footprint.load_peak_bytes - held_bytes)
 
