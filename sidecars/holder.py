@@ -26,25 +26,8 @@ from vram_arbiter.sidecars.host_weights import HostWeights
 PIECE_BYTES: Final = 16 * MIB
 REPEATS: Final = 5
 WIDTH: Final = 1024
-NF4: Final = {
-    "name": "vram-arbiter/selftest",
-    "version": "0.1.0",
-    "license": "apache-2.0",
-    "kind": "detector",
-    "embodiment_tags": ["any"],
-    "chunk_size": 1,
-    "weights_uri": "local://models/selftest",
-    "description": "two linear layers",
-    "latency_budget": {"per_chunk_ms": 100},
-    "actions": ["detect"],
-    "detector": {"labels": ["cube"]},
-    "quantization": {
-        "dtype": "int4",
-        "extra": {"compute_dtype": "float32", "min_params_to_quantize": 0, "skip_modules": []},
-    },
-}
-"""Manifest of the layers that `nf4` quantizes: computed in float32, so that CPU and GPU differ by
-the order of additions alone."""
+NF4: Final = {"compute_dtype": "float32", "min_params_to_quantize": 0, "skip_modules": []}
+"""In float32, CPU and GPU differ by the order of additions alone."""
 
 
 class Holder:
@@ -61,13 +44,8 @@ class Holder:
         self._memory = _open(device)
         return {"pid": os.getpid()}
 
-    def touch(self) -> JsonMap:
-        """Make the context."""
-        self._memory.touch()
-        return {}
-
     def fill(self, size_bytes: int) -> JsonMap:
-        """Allocate, beside the context."""
+        """Make the context, and allocate beside it."""
         self._memory.touch()
         self._blocks += fill(self._memory, "weights", size_bytes, bytes_per_s=None)
         return {}
@@ -137,13 +115,18 @@ class Holder:
         import torch
 
         from vram_arbiter.schemas.manifest import RSkillManifest
+        from vram_arbiter.schemas.manifest.contracts import Quantization
         from vram_arbiter.sidecars.quantization import quantize_linear
 
+        # of a manifest, only this is read
+        asked = Quantization.model_validate({"dtype": "int4", "extra": NF4})
+        fields: dict[str, Any] = {"name": "selftest", "quantization": asked}
+        manifest = RSkillManifest.model_construct(**fields)
         torch.manual_seed(0)
         layers = (torch.nn.Linear(WIDTH, WIDTH, bias=False) for _ in range(2))
         network = torch.nn.Sequential(*layers).eval().requires_grad_(False)
         before = _size(network)
-        quantize_linear(network, RSkillManifest.model_validate(NF4))
+        quantize_linear(network, manifest)
         values, device = torch.ones(1, WIDTH), self._memory.torch_device
         with torch.inference_mode():
             here = network(values)

@@ -11,7 +11,7 @@ from vram_arbiter.clients.cli import arguments, files, terminal
 from vram_arbiter.clients.cli.doctor.machine import ask_nvml
 from vram_arbiter.clients.cli.replies import NO, OK
 from vram_arbiter.clients.selftest import report
-from vram_arbiter.clients.selftest.bed import READING_S, in_thread
+from vram_arbiter.clients.selftest.bed import READING_S, answered_within
 from vram_arbiter.clients.selftest.rows import ROWS
 from vram_arbiter.clients.selftest.run import Result, Wanted, selftest
 from vram_arbiter.schemas.defaults import GIB, MIB
@@ -53,12 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    logging.getLogger("vram_arbiter.clients").setLevel(logging.ERROR)  # a row kills the daemon
     results = asyncio.run(_run(args))
     return OK if all(one.verdict in ("pass", "skipped") for one in results) else NO
 
 
 async def _run(args: argparse.Namespace) -> list[Result]:
-    logging.getLogger("vram_arbiter.clients").setLevel(logging.ERROR)  # a row kills the daemon
     index, why = await _index(args.gpu)
     simulated, gpus = index is None, list[Gpu]()
 
@@ -74,11 +74,11 @@ async def _run(args: argparse.Namespace) -> list[Result]:
 
     rows = [row for row in ROWS if args.row is None or row.id in args.row]
     results = await selftest(Wanted(index, args.memory, args.within, rows), begun, tell)
-    print(report.summary_of(results, simulated=simulated))
-    machine = report.machine_of(gpus[0])
+    told = report.told(gpus[0], results, simulated=simulated)
+    print(told["summary"])
     for place, written in ((args.json, report.as_json), (args.report, report.as_markdown)):
         if place is not None:
-            files.replace(place, written(machine, results, simulated=simulated))
+            files.replace(place, written(told))
     return results
 
 
@@ -87,7 +87,7 @@ async def _index(gpu: str) -> tuple[int | None, str]:
     without memory of its own, ProbeFailed where the driver hangs."""
     if gpu == FAKE:
         return None, "--gpu fake"
-    nvml = await in_thread(ask_nvml, READING_S)
+    nvml = await answered_within(READING_S, ask_nvml)
     if gpu == AUTO and nvml.error in NO_DRIVER:
         return None, nvml.problem
     if nvml.without_memory:

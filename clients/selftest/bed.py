@@ -7,11 +7,9 @@ import asyncio
 import json
 import os
 import sys
-import threading
 import time
 from asyncio.subprocess import PIPE, Process
 from collections.abc import AsyncIterator, Callable, Collection, Mapping
-from concurrent.futures import Future
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -24,12 +22,12 @@ from vram_arbiter.clients.cli.demo_programs import Programs
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.foreign.program import dying_with_parent, send_below
-from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.clients.sidecar.build import CLIENTS
 from vram_arbiter.schemas.defaults import VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
 from vram_arbiter.schemas.errors import ProbeFailed, SidecarUnavailable, from_wire
 from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
 from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.runtime.threads import in_daemon_thread
 from vram_arbiter.schemas.sizes import format_bytes
 
 READING_S: Final = 5.0
@@ -39,7 +37,10 @@ END_S: Final = 10.0
 MODEL_S: Final = 90.0
 """Imports of three sidecars at once, on two busy cores."""
 HOLDER: Final = (sys.executable, "-m", "vram_arbiter.sidecars.holder")
-RUN: Final = (sys.executable, "-m", "vram_arbiter.clients", "run", "--min-residency", "0")
+RUN: Final = (
+    sys.executable, "-m", "vram_arbiter.clients", "run", "--min-residency", "0", "--on-revoke",
+    "term",
+)  # fmt: skip
 
 
 class Skipped(Exception):
@@ -56,54 +57,36 @@ def need(*packages: str, extra: str) -> None:
         raise Skipped(f"install 'vram-arbiter[{extra}]'")
 
 
-async def in_thread[T](work: Callable[[], T], limit_s: float) -> T:
-    """Do work that may hang. A thread that hangs is left behind, and keeps no program from ending.
-
-    Raises what the work raises, and ProbeFailed after `limit_s`.
-    """
-    done: Future[T] = Future()
-    done.set_running_or_notify_cancel()
-
-    def run() -> None:
-        try:
-            done.set_result(work())
-        except BaseException as error:  # noqa: BLE001  raised where it is awaited
-            done.set_exception(error)
-
-    threading.Thread(target=run, name="selftest", daemon=True).start()
+async def answered_within[T](limit_s: float, work: Callable[[], T]) -> T:
+    """Do work of the driver, which may hang. Raises ProbeFailed after `limit_s`."""
     try:
         async with asyncio.timeout(limit_s):
-            return await asyncio.shield(asyncio.wrap_future(done))
+            return await in_daemon_thread(work, "driver")
     except TimeoutError:
-        raise ProbeFailed(
-            f"the driver gave no answer within {limit_s:g} s", hint="see nvidia-smi and dmesg"
-        ) from None
+        late = f"the driver gave no answer within {limit_s:g} s"
+        raise ProbeFailed(late, hint="see nvidia-smi and dmesg") from None
 
 
+@dataclass(slots=True)
 class Holder:
     """A process of `sidecars.holder`; `process` is it, or the `vramctl run` that started it."""
 
-    pid: int
-
-    def __init__(self, process: Process, log: Path) -> None:
-        self.process = process
-        self._log = log
-
-    async def begin(self) -> None:
-        """Wait until it runs: under a lease, until that is granted."""
-        self.pid = (await self._answer())["pid"]
+    process: Process
+    log: Path
+    pid: int = 0
 
     async def ask(self, word: str, *sizes: int) -> JsonMap:
         """Raises the process's typed error, and SidecarUnavailable where it has ended."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{' '.join([word, *map(str, sizes)])}\n".encode())
-        return await self._answer()
+        return await self.answer()
 
-    async def _answer(self) -> JsonMap:
+    async def answer(self) -> JsonMap:
+        """Return its next line; the first one comes unasked. Raises as `ask`."""
         assert self.process.stdout is not None
         line = await self.process.stdout.readline()
         if not line:
-            told = self._log.read_text(errors="replace").splitlines()[-1:]
+            told = self.log.read_text(errors="replace").splitlines()[-1:]
             raise SidecarUnavailable(f"a holder ended: {''.join(told)}")
         answer: JsonMap = json.loads(line)
         if "error" in answer:
@@ -126,15 +109,6 @@ class Holder:
 
 
 @dataclass(slots=True)
-class Model:
-    """A sidecar with its model resident."""
-
-    client: Any  # of the manifest's kind
-    manifest: RSkillManifest
-    pid: int
-
-
-@dataclass(slots=True)
 class Bed:
     """Where rows are measured. `memory_bytes` is the most that is on the GPU at a time;
     `lease_bytes` are all that the daemon has, so that one lease excludes another."""
@@ -149,7 +123,6 @@ class Bed:
     skills: Collection[str]  # whose sidecars are needed
     patience_s: float = VERIFY_TIMEOUT_S  # of memory that is on its way back
     copies: JsonMap = field(default_factory=dict)
-    _started: bool = False  # the sidecars
 
     @property
     def simulated(self) -> bool:
@@ -160,10 +133,9 @@ class Bed:
         """Bytes of a holder beside its context."""
         return self.memory_bytes // 4
 
-    # -- readings
     async def read(self) -> Reading:
         """Raises ProbeFailed."""
-        return await in_thread(self.gpu.read, READING_S)
+        return await answered_within(READING_S, self.gpu.read)
 
     async def used(self) -> int:
         """Return the GPU's used bytes. Raises ProbeFailed."""
@@ -179,7 +151,13 @@ class Bed:
             await asyncio.sleep(POLL_S)
         return time.monotonic() - began_s
 
-    # -- children
+    async def restart_daemon(self) -> None:
+        """Kill the daemon, and start it again on the same files."""
+        process = self.programs.running["arbiter"].process
+        send_below(process.pid, SIGKILL)
+        await process.wait()
+        await self.programs.start("arbiter", "arbiter", *self.daemon)
+
     @asynccontextmanager
     async def holder(
         self, lease: str = "", environ: Mapping[str, str] | None = None
@@ -194,8 +172,8 @@ class Bed:
             need("torch", extra="sidecars")
         used_bytes, command = await self.used(), [*HOLDER, self.gpu.device]
         if lease:
-            vram = ("--vram", f"{self.lease_bytes}B", "--gpu", self.gpu.uuid)
-            command = [*RUN, *vram, "--name", lease, "--on-revoke", "term", "--", *command]
+            need_of = ("--vram", f"{self.lease_bytes}B", "--gpu", self.gpu.uuid, "--name", lease)
+            command = [*RUN, *need_of, "--", *command]
         path = self.programs.log_dir / "holder.log"
         with path.open("wb") as log:
             process = await asyncio.create_subprocess_exec(
@@ -204,56 +182,37 @@ class Bed:
             )  # fmt: skip
         made = Holder(process, path)
         try:
-            await made.begin()
+            made.pid = (await made.answer())["pid"]
             yield made
         finally:
             await made.end()
         await self.returned(used_bytes)
 
     @asynccontextmanager
-    async def model(self, skill: str) -> AsyncIterator[Model]:
-        """Make the model of a shipped skill resident, and unload it again. All sidecars start at
-        first use. Its bytes are back at the end of the block.
+    async def model(self, skill: str) -> AsyncIterator[tuple[Any, RSkillManifest]]:
+        """Make the model of a shipped skill resident, and unload it again. Gives the client of its
+        kind. All sidecars start at first use. Its bytes are back at the end of the block.
 
         Raises Skipped, Missed, SidecarUnavailable, and the sidecar's errors.
         """
         need("torch", "transformers", "lerobot", "PIL", extra="sidecars")
         manifest = load_manifest(configs_folder(os.environ) / "rskills" / skill / "rskill.yaml")
-        if not self._started:
-            self._started = True
-            for name in self.skills:
-                await self._start(name)
-        endpoint = f"ipc://{self.programs.log_dir}/{skill}.sock"
-        async with CLIENTS[manifest.kind](endpoint, connect_timeout_s=MODEL_S) as client:
-            await self._answers(client)
+        for name in sorted(set(self.skills) - set(self.programs.running)):
+            await self.programs.start(
+                name, "sidecars", "--name", name, "--rskill", name, "--device", self.gpu.device,
+                "--gpu", self.gpu.uuid, "--footprint", str(self.memory_bytes),
+                "--min-residency-s", "0", "--parent", str(os.getpid()),
+            )  # fmt: skip
+        async with CLIENTS[manifest.kind](f"ipc://{self.programs.log_dir}/{skill}.sock") as client:
+            try:
+                await client.ping(timeout_s=MODEL_S)
+            except SidecarUnavailable:
+                self.programs.check()  # says why it ended
+                raise
             used_bytes = await self.used()
             await client.load()
             try:
-                yield Model(client, manifest, self.programs.running[skill].process.pid)
+                yield client, manifest
             finally:
                 await client.unload()
             await self.returned(used_bytes)
-
-    async def _start(self, skill: str) -> None:
-        await self.programs.start(
-            skill, "sidecars", "--name", skill, "--rskill", skill, "--device", self.gpu.device,
-            "--gpu", self.gpu.uuid, "--footprint", str(self.memory_bytes),
-            "--min-residency-s", "0", "--parent", str(os.getpid()),
-        )  # fmt: skip
-
-    async def _answers(self, client: SidecarClient) -> None:
-        try:
-            await client.ping(timeout_s=MODEL_S)
-        except SidecarUnavailable:
-            self.programs.check()  # says why it ended
-            raise
-
-    async def restart_daemon(self) -> None:
-        """Kill the daemon, and start it again on the same files."""
-        process = self.programs.running["arbiter"].process
-        send_below(process.pid, SIGKILL)
-        await process.wait()
-        await self.start_daemon()
-
-    async def start_daemon(self) -> None:
-        await self.programs.start("arbiter", "arbiter", *self.daemon)

@@ -6,7 +6,7 @@ import os
 import tempfile
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -16,7 +16,7 @@ from vram_arbiter.clients.cli.demo_programs import Programs
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.link import is_listening
 from vram_arbiter.clients.net.request import ask
-from vram_arbiter.clients.selftest.bed import READING_S, Bed, Missed, Skipped, in_thread
+from vram_arbiter.clients.selftest.bed import READING_S, Bed, Missed, Skipped, answered_within
 from vram_arbiter.clients.selftest.rows import BEAT_S, LAST, Row
 from vram_arbiter.schemas.defaults import RESERVE_BYTES, VERIFY_TOLERANCE_BYTES
 from vram_arbiter.schemas.errors import (
@@ -25,16 +25,11 @@ from vram_arbiter.schemas.errors import (
     SidecarUnavailable,
     VramError,
 )
-from vram_arbiter.schemas.runtime.endpoints import (
-    ENDPOINT_VARIABLE,
-    EXAMPLE,
-    RUNTIME_VARIABLE,
-    arbiter_endpoint,
-)
+from vram_arbiter.schemas.runtime import endpoints
 from vram_arbiter.schemas.sizes import format_bytes
 from vram_arbiter.schemas.wire.requests import Status
 
-type Verdict = Literal["pass", "miss", "skipped", "failed"]
+type Verdict = Literal["pass", "miss", "failed", "skipped"]
 
 START_S: Final = 30.0
 SIMULATED: Final = "fake:8GiB"
@@ -54,15 +49,12 @@ class Wanted:
 class Result:
     """What a row found. `figure` None: none was measured; `limit` "": it has none here."""
 
-    id: str
-    what: str
+    row: Row
     verdict: Verdict
     figure: float | None
-    unit: str
     limit: str
-    source: str
     remark: str
-    seconds: float
+    seconds: float = 0.0
 
 
 async def selftest(
@@ -95,15 +87,15 @@ async def _made(wanted: Wanted, folder: str) -> AsyncIterator[Bed]:
     """Read the GPU, and start a daemon on it; end that and all other children with the block."""
     gpu, found = await _open(wanted)
     endpoint = f"ipc://{folder}/arbiter.sock"
-    environ = {RUNTIME_VARIABLE: folder, ENDPOINT_VARIABLE: endpoint, "TMPDIR": folder}
-    programs = Programs(Path(folder), environ)
+    environ = {endpoints.RUNTIME_VARIABLE: folder, endpoints.ENDPOINT_VARIABLE: endpoint}
+    programs = Programs(Path(folder), environ | {"TMPDIR": folder})
     source = SIMULATED if gpu is None else "nvml"
     daemon = ("--gpu", source, "--state-dir", f"{folder}/state")
     try:
         await programs.start("arbiter", "arbiter", *daemon)
         async with AsyncClient("selftest", endpoint=endpoint, connect_timeout_s=START_S) as client:
             gpu = gpu or open_gpu(f"fake:{folder}/fakegpu")
-            programs.environ = {**environ, **gpu.environ}
+            programs.environ = {**programs.environ, **gpu.environ}
             async with asyncio.timeout(START_S):
                 room = await _room(client, gpu.uuid)
             skills = {row.skill for row in wanted.rows if row.skill}
@@ -123,13 +115,13 @@ async def _open(wanted: Wanted) -> tuple[Gpu | None, Reading | None]:
     ConfigError, NoGpu, ProbeFailed."""
     if wanted.index is None:
         return None, None
-    gpu = await in_thread(lambda: open_gpu(f"cuda:{wanted.index}"), READING_S)
+    gpu = await answered_within(READING_S, lambda: open_gpu(f"cuda:{wanted.index}"))
     if (endpoint := leased_at(gpu.uuid)) is not None:
         raise ConfigError(
             f"the arbiter at {endpoint} leases {gpu.name} ({gpu.uuid}), or does not say",
             hint="stop it (systemctl stop vram-arbiter), or name another GPU with --gpu",
         )
-    found = await in_thread(gpu.read, READING_S)
+    found = await answered_within(READING_S, gpu.read)
     free_bytes, needed_bytes = gpu.total_bytes - found.used_bytes, wanted.memory_bytes
     if free_bytes < needed_bytes + RESERVE_BYTES:
         raise ConfigError(
@@ -143,12 +135,10 @@ async def _open(wanted: Wanted) -> tuple[Gpu | None, Reading | None]:
 def leased_at(uuid: str, environ: Mapping[str, str] = os.environ) -> str | None:
     """Return the endpoint of an arbiter of this machine that leases a GPU, or does not answer;
     None: there is none. This user's and the system's are asked."""
-    endpoints = [EXAMPLE]
-    try:
-        endpoints.insert(0, arbiter_endpoint(environ, os.getuid()))
-    except ConfigError:
-        pass  # this user has no runtime folder, and no arbiter
-    for endpoint in filter(is_listening, endpoints):
+    asked = [endpoints.EXAMPLE]
+    with suppress(ConfigError):  # this user has no folder for sockets, and no arbiter
+        asked.insert(0, endpoints.arbiter_endpoint(environ, os.getuid()))
+    for endpoint in filter(is_listening, asked):
         try:
             leased = [view["gpu"] for view in ask(Status(), endpoint)["gpus"]]
         except (VramError, KeyError):
@@ -171,10 +161,12 @@ async def _room(client: AsyncClient, gpu: str) -> int:
 
 async def judged(row: Row, bed: Bed, left_s: float) -> Result:
     """Measure one row in `left_s` at most. Never raises: a row that fails hides no other."""
-    limited = not (row.timed_model and bed.simulated)
-    figure: float | None = None
-    verdict: Verdict
+    limit = "" if row.timed_model and bed.simulated else row.limit
     began_s, limit_s = time.monotonic(), min(row.limit_s, left_s)
+
+    def result(verdict: Verdict, remark: str, figure: float | None = None) -> Result:
+        return Result(row, verdict, figure, limit, remark, round(time.monotonic() - began_s, 3))
+
     try:
         if row.hardware and bed.simulated:
             raise Skipped("needs an NVIDIA GPU")
@@ -182,15 +174,13 @@ async def judged(row: Row, bed: Bed, left_s: float) -> Result:
             raise Skipped("no time was left: see --within")
         async with asyncio.timeout(limit_s):
             figure, remark = await row.measure(bed)
-        verdict = "pass" if not limited or row.holds(figure) else "miss"
+        holds = not limit or row.least <= figure <= row.most
+        return result("pass" if holds else "miss", remark, figure)
     except Skipped as why:
-        verdict, remark = "skipped", str(why)
+        return result("skipped", str(why))
     except Missed as why:
-        verdict, remark = "miss", str(why)
+        return result("miss", str(why))
     except TimeoutError:
-        verdict, remark = "failed", f"no result within {limit_s:.0f} s"
+        return result("failed", f"no result within {limit_s:.0f} s")
     except Exception as error:  # noqa: BLE001  a defect of one row is a result, too
-        verdict, remark = "failed", f"{type(error).__name__}: {error}"
-    seconds = round(time.monotonic() - began_s, 3)
-    limit = row.limit if limited else ""
-    return Result(row.id, row.what, verdict, figure, row.unit, limit, row.source, remark, seconds)
+        return result("failed", f"{type(error).__name__}: {error}")

@@ -15,15 +15,13 @@ from vram_arbiter.arbiter.host.gpu.fake import make_gpu
 from vram_arbiter.clients.calibration.gpu import Gpu, Reading, fake_gpu
 from vram_arbiter.clients.cli.demo_programs import Programs
 from vram_arbiter.clients.selftest import report, rows
-from vram_arbiter.clients.selftest.bed import Bed, Missed, Skipped, in_thread, need
+from vram_arbiter.clients.selftest.bed import Bed, Missed, Skipped, answered_within, need
 from vram_arbiter.clients.selftest.run import Result, judged
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.errors import NoGpu, ProbeFailed
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime import fakegpu_folder, procfs
-
-MACHINE = {"gpu": "G|PU", "packages": {"torch": "2"}}
 
 
 def bed_on(gpu: Gpu, folder: Path) -> Bed:
@@ -40,8 +38,13 @@ def bed(tmp_path: Path) -> Bed:
 
 
 def row(measure: Any, **fields: Any) -> rows.Row:
-    given = {"id": "r", "what": "w", "unit": "ms", "source": "s", "most": 5.0, **fields}
+    given = {"id": "r", "claim": "c", "unit": "ms", "source": "s", "most": 5.0, **fields}
     return rows.Row(measure=measure, **given)
+
+
+def row_of(name: str) -> rows.Row:
+    (found,) = [row for row in rows.ROWS if row.id == name]
+    return found
 
 
 async def found(bed: Bed, figure: float = 4.0) -> rows.Found:
@@ -62,8 +65,8 @@ async def endless(bed: Bed) -> rows.Found:
     [
         (row(found), 9.0, "pass", "seen"),
         (row(partial(found, figure=6.0)), 9.0, "miss", "seen"),
-        (row(found, most=None, least=5.0), 9.0, "miss", "seen"),
-        (row(partial(found, figure=6.0), skill="so101-grab"), 9.0, "pass", "seen"),
+        (row(found, most=float("inf"), least=5.0), 9.0, "miss", "seen"),
+        (row(partial(found, figure=6.0), timed_model=True), 9.0, "pass", "seen"),
         (row(found, hardware=True), 9.0, "skipped", "needs an NVIDIA GPU"),
         (row(found), -1.0, "skipped", "no time was left: see --within"),
         (row(endless), 0.01, "failed", "no result within 0 s"),
@@ -91,14 +94,14 @@ def test_what_a_row_needs_is_named() -> None:
 def test_a_driver_that_hangs_is_left_behind() -> None:
     """The program ends all the same: the thread is a daemon's."""
     with pytest.raises(ProbeFailed, match="no answer within"):
-        asyncio.run(in_thread(lambda: time.sleep(1000), 0.01))
+        asyncio.run(answered_within(0.01, lambda: time.sleep(1000)))
 
 
 RESULTS = [
-    Result("a", "one", "pass", 4.0, "ms", "≤ 5 ms", "s", "x|y", 0.1),
-    Result("b", "two", "miss", 6.0, "ms", "≤ 5 ms", "s", "slow", 0.1),
-    Result("c", "three", "skipped", None, "ms", "≤ 5 ms", "s", "why", 0.1),
-    Result("d", "four", "failed", None, "ms", "", "s", "NoGpu: \x1b[2Jnone", 0.1),
+    Result(row(found, id="a"), "pass", 4.0, "≤ 5 ms", "x|y"),
+    Result(row(found, id="b"), "miss", 6.0, "≤ 5 ms", "slow"),
+    Result(row(found, id="c"), "skipped", None, "≤ 5 ms", "why"),
+    Result(row(found, id="d"), "failed", None, "", "NoGpu: \x1b[2Jnone"),
 ]
 
 
@@ -114,18 +117,18 @@ def test_a_table_says_what_did_not_pass_and_what_is_simulated() -> None:
     assert "SIMULATED" in report.summary_of(RESULTS, simulated=True)
 
 
-def test_an_issue_gets_a_table() -> None:
+def test_an_issue_gets_a_table(bed: Bed) -> None:
     """A bar in a text would end its cell."""
-    text = report.as_markdown(MACHINE, RESULTS, simulated=True)
+    text = report.as_markdown(report.told(bed.gpu, RESULTS, simulated=True))
     assert "SIMULATED" in text
-    assert {line.count("|") for line in text.splitlines() if line.startswith("| ")} == {8}
+    assert "- memory: 8 GiB" in text
+    assert {line.count("|") for line in text.splitlines() if line.startswith("| ")} == {9}
 
 
 # -- rows on a simulated GPU, without a daemon
 @pytest.mark.parametrize("one", ["reading", "context", "lag-free", "lag-exit"])
 def test_a_holder_is_measured(bed: Bed, one: str) -> None:
-    (chosen,) = [row for row in rows.ROWS if row.id == one]
-    result = asyncio.run(judged(chosen, bed, 60.0))
+    result = asyncio.run(judged(row_of(one), bed, 60.0))
     assert result.verdict == "pass", result
     assert (bed.gpu.read().used_bytes, result.figure is None) == (0, False)
     if one == "context":
@@ -186,9 +189,10 @@ class Suspending:
 
 @pytest.mark.heavy
 def test_a_suspended_process_leaves_nothing_and_continues(bed: Bed) -> None:
-    (pages,) = [row for row in rows.ROWS if row.id == "checkpoint"]
     action = Suspending(bed.programs.log_dir / "gpu")
-    here = replace(pages, measure=partial(rows.checkpoint, action=action), hardware=False)
+    here = replace(
+        row_of("checkpoint"), measure=partial(rows.checkpoint, action=action), hardware=False
+    )
     result = asyncio.run(judged(here, bed, 60.0))
     assert (result.verdict, result.figure) == ("pass", 0.0), result
     assert "resumed in" in result.remark
@@ -197,8 +201,7 @@ def test_a_suspended_process_leaves_nothing_and_continues(bed: Bed) -> None:
 def test_a_driver_without_checkpoints_is_no_failure(tmp_path: Path) -> None:
     """Here is none at all, or the package is not installed."""
     real = Gpu("GPU-1", "G", "1", GIB, "none", {}, lambda: Reading(0, {}))
-    (one,) = [row for row in rows.ROWS if row.id == "checkpoint"]
-    result = asyncio.run(judged(one, bed_on(real, tmp_path), 60.0))
+    result = asyncio.run(judged(row_of("checkpoint"), bed_on(real, tmp_path), 60.0))
     assert (result.verdict, "; " in result.remark) == ("skipped", True), result
 
 
