@@ -22,6 +22,7 @@ from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.sidecars.device.fake import FakeMemory
 from vram_arbiter.sidecars.device.memory import Block, DeviceMemory, fill
 from vram_arbiter.sidecars.host_weights import HostWeights
+from vram_arbiter.sidecars.parent import end_with
 
 PIECE_BYTES: Final = 16 * MIB
 REPEATS: Final = 5
@@ -152,9 +153,11 @@ def _size(network: Any) -> int:
 
 
 def _forked(work: Callable[[], JsonMap]) -> JsonMap:
-    """Do the work in a fork of this process. Raises ModelError where that ends without an answer."""
+    """Do the work in a fork of this process. Raises ModelError where it ends without an answer."""
     read, write = os.pipe()
+    parent = os.getpid()
     if os.fork() == 0:
+        end_with(parent)
         os.write(write, json.dumps(_answer(work)).encode())
         os._exit(0)
     os.close(write)

@@ -46,8 +46,8 @@ class Programs:
     running: dict[str, DemoProgram] = field(default_factory=dict)
 
     async def start(self, name: str, package: str, *arguments: str) -> DemoProgram:
-        """Start `python -m vram_arbiter.PACKAGE ARGUMENTS`, which dies with this process; its output
-        goes to `<log_dir>/<name>.log`."""
+        """Start `python -m vram_arbiter.PACKAGE ARGUMENTS`, which dies with this process; its
+        output goes to `<log_dir>/<name>.log`."""
         log = self.log_dir / f"{name}.log"
         with log.open("wb") as sink:
             process = await asyncio.create_subprocess_exec(

@@ -1,4 +1,4 @@
-"""`vramctl selftest`: the rows of `clients.selftest`, on the machine's GPU or on a simulated one."""
+"""`vramctl selftest`: rows of `clients.selftest`, on the machine's GPU or on a simulated one."""
 
 import argparse
 import asyncio

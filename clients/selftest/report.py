@@ -4,6 +4,7 @@ import json
 import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Final
 
@@ -23,16 +24,14 @@ def line_of(result: Result, *, simulated: bool) -> str:
     passed, mark = result.verdict == "pass", MARKS[result.verdict]
     mark = f"({mark})" if simulated and passed else f" {mark} "
     remark = result.remark if passed else f"{result.verdict}: {result.remark}"
-    return printable(
-        f"{mark} {result.row.id:<14}{_figure(result):>14}  {result.limit:<16}  {remark}"
-    )
+    return printable(f"{mark} {result.id:<14}{_figure(result):>14}  {result.limit:<16}  {remark}")
 
 
 def _figure(result: Result) -> str:
     if result.figure is None:
         return ""
     form = ".0f" if abs(result.figure) >= 100 else ".3g"
-    return f"{result.figure:{form}} {result.row.unit}".rstrip()
+    return f"{result.figure:{form}} {result.unit}".rstrip()
 
 
 def summary_of(results: Sequence[Result], *, simulated: bool) -> str:
@@ -48,20 +47,9 @@ def told(gpu: Gpu, results: Sequence[Result], *, simulated: bool) -> JsonMap:
         "gpu": gpu.name, "memory": format_bytes(gpu.total_bytes), "driver": gpu.driver,
         "kernel": platform.release(), "python": platform.python_version(),
     } | {name: found for name in PACKAGES if (found := _version(name))}  # fmt: skip
-    rows = [
-        {
-            "id": one.row.id, "claim": one.row.claim, "figure": _rounded(one.figure), "unit": one.row.unit,
-            "limit": one.limit, "source": one.row.source, "verdict": one.verdict,
-            "remark": one.remark, "seconds": one.seconds,
-        }
-        for one in results
-    ]  # fmt: skip
+    rows = [asdict(one) for one in results]
     summary = summary_of(results, simulated=simulated)
     return {"summary": summary, "simulated": simulated, "machine": machine, "rows": rows}
-
-
-def _rounded(figure: float | None) -> float | None:
-    return None if figure is None else float(f"{figure:.4g}")
 
 
 def _version(package: str) -> str:

@@ -2,6 +2,8 @@
 its limit and the source of that."""
 
 import asyncio
+import io
+import math
 import os
 import statistics
 import time
@@ -19,6 +21,7 @@ from vram_arbiter.clients.selftest.bed import MODEL_S, Bed, Missed, Skipped, ans
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import MIB, VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
 from vram_arbiter.schemas.errors import CheckpointUnsupported, VramError, WaitTimeout
+from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
@@ -30,6 +33,13 @@ DETECTOR, VLM, POLICY = "so101-detector", "so101-scene-vlm", "so101-grab"
 READINGS: Final = 20
 ASKING_S: Final = 1.0
 """How long a request waits beside a stowaway: several readings."""
+CUBE: Final = (
+    (((300, 230), (340, 230), (340, 270), (300, 270)), "#c81e1e"),
+    (((300, 230), (313, 217), (353, 217), (340, 230)), "#ff3838"),
+    (((340, 230), (353, 217), (353, 257), (340, 270)), "#8c1515"),
+)
+"""Its front, top and side: corners in pixels, and color."""
+CUBE_PX, CUBE_SIDE_PX = (326, 243), 40
 BEAT_S: Final = 0.05
 CHECKPOINT_S: Final = 20.0
 ROW_S: Final = 30.0
@@ -200,13 +210,9 @@ async def evict(bed: Bed) -> Found:
             await following.ask("fill", bed.part_bytes)
             events = (await bed.client.history(kinds=("verified",))).events
             event = next(one for one in events if one["consumer"] == "victim")
-            return event["ms"], _expected("verified", event["verdict"])
-
-
-def _expected(wanted: str, found: str) -> str:
-    if found != wanted:
-        raise Missed(f"expected {wanted}, found {found}")
-    return found
+            if event["verdict"] != "verified":
+                raise Missed(f"the verdict is {event['verdict']}")
+            return event["ms"], "verified"
 
 
 @row("MiB", source="limits.md", least=1)
@@ -298,31 +304,58 @@ def _model(skill: str, budget_ms: float) -> dict[str, Any]:
 
 @row("ms", **_model(DETECTOR, 1000))
 async def detector(bed: Bed) -> Found:
-    """A detector answers within."""
-    return await _answered(bed, DETECTOR)
+    """A detector finds a drawn cube within."""
+    picture = _cube()
+    found, told = await _answered(
+        bed, DETECTOR, lambda client, _: client.detect(picture, "red cube")
+    )
+    if not found or math.dist(found[0].centre, CUBE_PX) > CUBE_SIDE_PX / 2:
+        raise Missed(f"expected the cube at {CUBE_PX}, found {found[:1]}")
+    return told
 
 
 @row("ms", **_model(VLM, 3000))
 async def vlm(bed: Bed) -> Found:
-    """A scene VLM answers within."""
-    return await _answered(bed, VLM)
+    """A scene VLM answers about it within."""
+    picture, question = _cube(), "Has the robot gripper grasped the red cube?"
+    said, told = await _answered(bed, VLM, lambda client, _: client.query(picture, question))
+    if not said.startswith("No"):
+        raise Missed(f"the drawn cube lies on a table, and the answer is {said!r}")
+    return told
 
 
 @row("ms", **_model(POLICY, 400))
 async def policy(bed: Bed) -> Found:
-    """A policy answers within."""
-    return await _answered(bed, POLICY)
+    """A policy answers to noise within."""
+    actions, told = await _answered(bed, POLICY, ASKED[Kind.VLA])
+    if not all(map(math.isfinite, actions["action"].ravel())):
+        raise Missed("its actions are not finite")
+    return told
 
 
-async def _answered(bed: Bed, skill: str) -> Found:
-    """Return the time of a model's second answer: the first loads its kernels."""
+async def _answered(
+    bed: Bed, skill: str, ask: Callable[[Any, RSkillManifest], Awaitable[Any]]
+) -> tuple[Any, Found]:
+    """Return a model's second answer and its time: the first loads its kernels."""
     before = await bed.used()
     async with bed.model(skill) as (client, manifest):
         for _ in range(2):
             began_s = time.perf_counter()
-            await ASKED[manifest.kind](client, manifest)
+            answer = await ask(client, manifest)
             seconds = time.perf_counter() - began_s
-        return seconds * 1000, f"resident in {(await bed.used() - before) / MIB:.0f} MiB"
+        size = f"resident in {(await bed.used() - before) / MIB:.0f} MiB"
+        return answer, (seconds * 1000, size)
+
+
+def _cube() -> bytes:
+    """Return a picture of a red cube on a table: 640 x 480 pixels, as PNG."""
+    from PIL import Image, ImageDraw
+
+    picture, written = Image.new("RGB", (640, 480), "#969696"), io.BytesIO()
+    for corners, color in CUBE:
+        ImageDraw.Draw(picture).polygon(corners, fill=color)
+    picture.save(written, "PNG")
+    return written.getvalue()
 
 
 # -- the end

@@ -49,10 +49,13 @@ class Wanted:
 class Result:
     """What a row found. `figure` None: none was measured; `limit` "": it has none here."""
 
-    row: Row
-    verdict: Verdict
+    id: str
+    claim: str
     figure: float | None
+    unit: str
     limit: str
+    source: str
+    verdict: Verdict
     remark: str
     seconds: float = 0.0
 
@@ -165,7 +168,8 @@ async def judged(row: Row, bed: Bed, left_s: float) -> Result:
     began_s, limit_s = time.monotonic(), min(row.limit_s, left_s)
 
     def result(verdict: Verdict, remark: str, figure: float | None = None) -> Result:
-        return Result(row, verdict, figure, limit, remark, round(time.monotonic() - began_s, 3))
+        seconds, of = round(time.monotonic() - began_s, 3), (row.unit, limit, row.source)
+        return Result(row.id, row.claim, figure, *of, verdict, remark, seconds)
 
     try:
         if row.hardware and bed.simulated:
@@ -174,6 +178,7 @@ async def judged(row: Row, bed: Bed, left_s: float) -> Result:
             raise Skipped("no time was left: see --within")
         async with asyncio.timeout(limit_s):
             figure, remark = await row.measure(bed)
+        figure = float(f"{figure:.4g}")
         holds = not limit or row.least <= figure <= row.most
         return result("pass" if holds else "miss", remark, figure)
     except Skipped as why:

@@ -7,8 +7,8 @@ from concurrent.futures import Future
 
 
 async def in_daemon_thread[T](work: Callable[[], T], name: str) -> T:
-    """Do the work in a thread that the program's end does not wait for, if it hangs. Raises what the
-    work raises."""
+    """Do the work in a thread that the program's end does not wait for, if it hangs. Raises what
+    the work raises."""
     done: Future[T] = Future()
     done.set_running_or_notify_cancel()
 

@@ -98,10 +98,10 @@ def test_a_driver_that_hangs_is_left_behind() -> None:
 
 
 RESULTS = [
-    Result(row(found, id="a"), "pass", 4.0, "≤ 5 ms", "x|y"),
-    Result(row(found, id="b"), "miss", 6.0, "≤ 5 ms", "slow"),
-    Result(row(found, id="c"), "skipped", None, "≤ 5 ms", "why"),
-    Result(row(found, id="d"), "failed", None, "", "NoGpu: \x1b[2Jnone"),
+    Result("a", "c", 4.0, "ms", "≤ 5 ms", "s", "pass", "x|y"),
+    Result("b", "c", 6.0, "ms", "≤ 5 ms", "s", "miss", "slow"),
+    Result("c", "c", None, "ms", "≤ 5 ms", "s", "skipped", "why"),
+    Result("d", "c", None, "ms", "", "s", "failed", "NoGpu: \x1b[2Jnone"),
 ]
 
 
