@@ -42,7 +42,8 @@ CUBE: Final = (
 CUBE_PX, CUBE_SIDE_PX = (326, 243), 40
 BEAT_S: Final = 0.05
 CHECKPOINT_S: Final = 20.0
-ROW_S: Final = 30.0
+ROW_S: Final = 40.0
+"""The first row may read torch from a cold disk."""
 UVM: Final = "/dev/nvidia-uvm"
 """Device file of CUDA's unified memory: `cuInit` opens it, and reading by NVML does not."""
 VERIFY: Final = {"source": "verify.timeout_s", "most": VERIFY_TIMEOUT_S * 1000}
@@ -281,8 +282,8 @@ async def fork_server(bed: Bed) -> Found:
         roots = [bed.programs.running[name].process.pid for name in (POLICY, "arbiter")]
         pids = [int(one.name) for one in procfs.PROC.iterdir() if one.name.isdecimal()]
         tree = [pid for pid in pids if any(is_below(pid, root) for root in roots)]
-        listed = (await bed.read()).processes or {}
-        holding = [pid for pid in tree if listed.get(pid) or _opened_uvm(pid)]
+        listed = (await bed.read()).processes or {}  # in a container: pids of the host
+        holding = [pid for pid in tree if (pid in listed if bed.simulated else _opened_uvm(pid))]
     if not holding:
         raise Missed("no process of the sidecar has a context")
     return len(holding) - 1, f"of {len(tree)} processes"

@@ -206,6 +206,7 @@ def test_a_driver_without_checkpoints_is_no_failure(tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
+@pytest.mark.nightly
 def test_copies_and_nf4_without_a_device(tmp_path: Path) -> None:
     """A device that is the CPU: the figures are those of host RAM."""
     cpu = Gpu("GPU-1", "G", "1", GIB, "none", {}, lambda: Reading(0, {}))
