@@ -59,7 +59,7 @@ class Row:
     """
 
     id: str
-    claim: str
+    what: str
     measure: Measure
     unit: str
     source: str
@@ -81,12 +81,12 @@ ROWS: Final[list[Row]] = []
 
 
 def row(unit: str, **fields: Any) -> Callable[[Measure], Measure]:
-    """Make a row of a function: its name is the id, and its docstring's first line the claim."""
+    """Make a row of a function: its name is the id, and its docstring says what it measures."""
 
     def made(measure: Measure) -> Measure:
-        claim = (measure.__doc__ or "").partition(".")[0]
+        what = (measure.__doc__ or "").partition(".")[0].removeprefix("Measure the ")
         name = measure.__name__.replace("_", "-")
-        ROWS.append(Row(name, claim, measure, unit, **fields))
+        ROWS.append(Row(name, what, measure, unit, **fields))
         return measure
 
     return made
@@ -95,7 +95,7 @@ def row(unit: str, **fields: Any) -> Callable[[Measure], Measure]:
 # -- the driver
 @row("ms", source="probe.load_s", most=d.LOAD_PROBE_S * 1000)
 async def reading(bed: Bed) -> Found:
-    """A reading takes, by the median."""
+    """Measure the median time of a reading."""
     times = []
     for _ in range(READINGS):
         began_s = time.perf_counter()
@@ -107,7 +107,7 @@ async def reading(bed: Bed) -> Found:
 
 @row("MiB", source="limits.md: 0.1 to 0.6 GB", most=572)
 async def context(bed: Bed) -> Found:
-    """A process that touches the GPU takes."""
+    """Measure the bytes of a process that has only touched the GPU."""
     async with bed.holder() as holder:
         before = await bed.used()
         await holder.ask("fill", 0)
@@ -119,7 +119,7 @@ async def context(bed: Bed) -> Found:
 
 @row("ms", **VERIFY)
 async def lag_free(bed: Bed) -> Found:
-    """Freed bytes are in a reading after."""
+    """Measure the time from a free to a reading that shows it."""
     async with bed.holder() as holder:
         await holder.ask("fill", 0)
         empty = await bed.used()
@@ -133,7 +133,7 @@ async def lag_free(bed: Bed) -> Found:
 
 @row("ms", **VERIFY)
 async def lag_exit(bed: Bed) -> Found:
-    """Bytes of an ended process are in a reading after."""
+    """Measure the time from a process's end to a reading that shows it."""
     before = await bed.used()
     async with bed.holder() as holder:
         await holder.ask("fill", bed.part_bytes)
@@ -143,14 +143,14 @@ async def lag_exit(bed: Bed) -> Found:
 
 @row("times", source="performance.md", most=2, hardware=True)
 async def restore(bed: Bed) -> Found:
-    """A restore takes the time of cudaMemcpy."""
+    """Measure the time of a restore, in times of one cudaMemcpy."""
     ours, plain = await _rates(bed, "restore_s", "pageable_s")
     return plain / ours, f"{ours:.1f} GB/s, cudaMemcpy {plain:.1f} GB/s"
 
 
 @row("times", source="CUDA C++ Best Practices: pinned memory", least=1, hardware=True)
 async def page_locked(bed: Bed) -> Found:
-    """Page-locked memory is as fast as pageable."""
+    """Measure the speed of page-locked memory, in times of pageable."""
     locked, plain = await _rates(bed, "page_locked_s", "pageable_s")
     return locked / plain, f"{locked:.1f} GB/s, pageable {plain:.1f} GB/s"
 
@@ -165,7 +165,7 @@ async def _rates(bed: Bed, *copies: str) -> list[float]:
 
 @row("", source="the CPU's answer", most=1e-3, hardware=True)
 async def nf4(bed: Bed) -> Found:
-    """Answers of NF4 on GPU and CPU differ by."""
+    """Measure the relative difference of NF4 on GPU and CPU."""
     need("torch", "bitsandbytes", extra="sidecars")
     async with bed.holder() as holder:
         told = await holder.ask("nf4")
@@ -176,7 +176,7 @@ async def nf4(bed: Bed) -> Found:
 
 @row("MiB", **TOLERANCE, hardware=True, limit_s=2 * ROW_S)
 async def checkpoint(bed: Bed, action: Action | None = None) -> Found:
-    """A suspended process, which continues with its numbers, leaves."""
+    """Measure the bytes of a suspended process, which then continues with its numbers."""
     action = action or CheckpointAction(CudaDriver(), CHECKPOINT_S)
     try:
         await answered_within(CHECKPOINT_S, action.check)
@@ -204,7 +204,7 @@ async def checkpoint(bed: Bed, action: Action | None = None) -> Found:
 # -- the arbiter
 @row("ms", **VERIFY)
 async def evict(bed: Bed) -> Found:
-    """The verdict on a victim's bytes, before the next grant, comes after."""
+    """Measure the time from an evicted holder's release to its verdict, before the next grant."""
     async with bed.holder("victim") as victim:
         await victim.ask("fill", bed.part_bytes)
         async with bed.holder("next") as following:
@@ -218,7 +218,7 @@ async def evict(bed: Bed) -> Found:
 
 @row("MiB", source="limits.md", least=1)
 async def stowaway(bed: Bed) -> Found:
-    """Nothing is granted beside a process without a lease, of which the daemon counts."""
+    """Measure the bytes of a stowaway that the daemon sees, while it grants nothing."""
     async with bed.holder() as holder:
         await holder.ask("fill", bed.part_bytes)
         await asyncio.sleep(d.SAMPLE_MAX_AGE_S)  # so long a reading from before it counts
@@ -239,7 +239,7 @@ def _all(bed: Bed) -> LeaseSpec:
 
 @row("ms", **VERIFY)
 async def kill_holder(bed: Bed) -> Found:
-    """Bytes of a killed holder are granted after."""
+    """Measure the time from a holder's SIGKILL to the grant of its bytes."""
     async with bed.holder("killed") as holder:
         await holder.ask("fill", bed.part_bytes)
         began_s = time.monotonic()
@@ -250,7 +250,7 @@ async def kill_holder(bed: Bed) -> Found:
 
 @row("s", source="lease.ttl_s + lease.fence_grace_s", most=d.LEASE_TTL_S + d.FENCE_GRACE_S)
 async def kill_daemon(bed: Bed) -> Found:
-    """The successor of a killed daemon knows the holder after."""
+    """Measure the time from the daemon's SIGKILL until its successor knows the holder."""
     async with bed.holder("kept") as holder:
         await holder.ask("fill", bed.part_bytes)
         before = await _held(bed)
@@ -277,7 +277,7 @@ async def _held(bed: Bed, wanted: Sequence[str] = ()) -> list[str]:
 # -- models
 @row("processes", source="limits.md", most=0, skill=POLICY, limit_s=MODEL_S + ROW_S)
 async def fork_server(bed: Bed) -> Found:
-    """Beside the model's, processes of sidecar and daemon that have a context."""
+    """Measure the processes of sidecar and daemon with a context, beside the model's."""
     async with bed.model(POLICY):
         roots = [bed.programs.running[name].process.pid for name in (POLICY, "arbiter")]
         pids = [int(one.name) for one in procfs.PROC.iterdir() if one.name.isdecimal()]
@@ -305,7 +305,7 @@ def _model(skill: str, budget_ms: float) -> dict[str, Any]:
 
 @row("ms", **_model(DETECTOR, 1000))
 async def detector(bed: Bed) -> Found:
-    """A detector finds a drawn cube within."""
+    """Measure the time in which a detector finds a drawn cube."""
     picture = _cube()
     found, told = await _answered(
         bed, DETECTOR, lambda client, _: client.detect(picture, "red cube")
@@ -317,7 +317,7 @@ async def detector(bed: Bed) -> Found:
 
 @row("ms", **_model(VLM, 3000))
 async def vlm(bed: Bed) -> Found:
-    """A scene VLM answers about it within."""
+    """Measure the time in which a scene VLM answers about it."""
     picture, question = _cube(), "Has the robot gripper grasped the red cube?"
     said, told = await _answered(bed, VLM, lambda client, _: client.query(picture, question))
     if not said.startswith("No"):
@@ -327,7 +327,7 @@ async def vlm(bed: Bed) -> Found:
 
 @row("ms", **_model(POLICY, 400))
 async def policy(bed: Bed) -> Found:
-    """A policy answers to noise within."""
+    """Measure the time in which a policy answers to noise."""
     actions, told = await _answered(bed, POLICY, ASKED[Kind.VLA])
     if not all(map(math.isfinite, actions["action"].ravel())):
         raise Missed("its actions are not finite")
@@ -362,7 +362,7 @@ def _cube() -> bytes:
 # -- the end
 @row("MiB", **TOLERANCE)
 async def left_as_found(bed: Bed) -> Found:
-    """Once all children have ended, more is used than before."""
+    """Measure the bytes that are used beside those of before, once all children have ended."""
     with suppress(Missed):  # the figure says so
         await bed.returned(bed.found.used_bytes)
     now = await bed.read()

@@ -50,7 +50,7 @@ class Result:
     """What a row found. `figure` None: none was measured; `limit` "": it has none here."""
 
     id: str
-    claim: str
+    what: str
     figure: float | None
     unit: str
     limit: str
@@ -169,7 +169,7 @@ async def judged(row: Row, bed: Bed, left_s: float) -> Result:
 
     def result(verdict: Verdict, remark: str, figure: float | None = None) -> Result:
         seconds, of = round(time.monotonic() - began_s, 3), (row.unit, limit, row.source)
-        return Result(row.id, row.claim, figure, *of, verdict, remark, seconds)
+        return Result(row.id, row.what, figure, *of, verdict, remark, seconds)
 
     try:
         if row.hardware and bed.simulated:
@@ -186,6 +186,7 @@ async def judged(row: Row, bed: Bed, left_s: float) -> Result:
     except Missed as why:
         return result("miss", str(why))
     except TimeoutError:
-        return result("failed", f"no result within {limit_s:.0f} s")
+        cut = "" if limit_s == row.limit_s else ", which was all that was left: see --within"
+        return result("failed", f"no result within {limit_s:.0f} s{cut}")
     except Exception as error:  # noqa: BLE001  a defect of one row is a result, too
         return result("failed", f"{type(error).__name__}: {error}")

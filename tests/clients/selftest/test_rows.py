@@ -38,7 +38,7 @@ def bed(tmp_path: Path) -> Bed:
 
 
 def row(measure: Any, **fields: Any) -> rows.Row:
-    given = {"id": "r", "claim": "c", "unit": "ms", "source": "s", "most": 5.0, **fields}
+    given = {"id": "r", "what": "w", "unit": "ms", "source": "s", "most": 5.0, **fields}
     return rows.Row(measure=measure, **given)
 
 
@@ -69,7 +69,12 @@ async def endless(bed: Bed) -> rows.Found:
         (row(partial(found, figure=6.0), timed_model=True), 9.0, "pass", "seen"),
         (row(found, hardware=True), 9.0, "skipped", "needs an NVIDIA GPU"),
         (row(found), -1.0, "skipped", "no time was left: see --within"),
-        (row(endless), 0.01, "failed", "no result within 0 s"),
+        (
+            row(endless),
+            0.01,
+            "failed",
+            "no result within 0 s, which was all that was left: see --within",
+        ),
         (row(endless, limit_s=0.01), 9.0, "failed", "no result within 0 s"),
         (row(partial(raised, Skipped("why"))), 9.0, "skipped", "why"),
         (row(partial(raised, Missed("what"))), 9.0, "miss", "what"),
@@ -103,6 +108,13 @@ RESULTS = [
     Result("c", "c", None, "ms", "≤ 5 ms", "s", "skipped", "why"),
     Result("d", "c", None, "ms", "", "s", "failed", "NoGpu: \x1b[2Jnone"),
 ]
+
+
+def test_a_row_is_declared_at_its_function() -> None:
+    assert row_of("kill-holder").what == "time from a holder's SIGKILL to the grant of its bytes"
+    assert row_of("page-locked").limit == "≥ 1 times"
+    assert row_of("nf4").limit == "≤ 0.001"
+    assert len({one.id for one in rows.ROWS}) == 16
 
 
 def test_a_table_says_what_did_not_pass_and_what_is_simulated() -> None:
