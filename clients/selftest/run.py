@@ -100,7 +100,7 @@ async def _made(wanted: Wanted, folder: str) -> AsyncIterator[Bed]:
             gpu = gpu or open_gpu(f"fake:{folder}/fakegpu")
             programs.environ = {**programs.environ, **gpu.environ}
             async with asyncio.timeout(START_S):
-                room = await _room(client, gpu.uuid)
+                room = await room_on(client, gpu.uuid)
             skills = {row.skill for row in wanted.rows if row.skill}
             found = found or gpu.read()
             yield Bed(gpu, found, wanted.memory_bytes, room, programs, client, daemon, skills)
@@ -151,11 +151,16 @@ def leased_at(uuid: str, environ: Mapping[str, str] = os.environ) -> str | None:
     return None
 
 
-async def _room(client: AsyncClient, gpu: str) -> int:
+async def room_on(client: AsyncClient, gpu: str) -> int:
     """Return the bytes that the daemon can lease now, less what the driver may take meanwhile: two
-    leases of so many never fit."""
+    leases of so many never fit. Raises ConfigError for a GPU that it does not lease."""
     while True:
-        (view,) = [one for one in (await client.status()).gpus if one.gpu == gpu]
+        views = {one.gpu: one for one in (await client.status()).gpus}
+        if (view := views.get(gpu)) is None:
+            raise ConfigError(
+                f"the daemon leases {', '.join(views)}, not {gpu}: is it split into instances?",
+                hint="name another GPU with --gpu",
+            )
         if view.measured_used_bytes is not None:
             left = view.capacity_bytes - view.reserve_bytes - view.stowaway_bytes
             return left - 2 * VERIFY_TOLERANCE_BYTES

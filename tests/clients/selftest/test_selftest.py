@@ -1,6 +1,7 @@
 """`vramctl selftest` as a program: on a simulated GPU, and on machines that a compiled
 `libnvidia-ml.so.1` plays."""
 
+import asyncio
 import json
 import os
 import signal
@@ -17,8 +18,10 @@ from tests.support.nvml_stub import GIB, MIB, NvmlStub
 from tests.support.process import Make, vramctl
 from tests.support.processes import alive, children
 from tests.support.waiting import PATIENCE_S, until
+from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.selftest.rows import LAST, READINGS, ROWS
-from vram_arbiter.clients.selftest.run import leased_at
+from vram_arbiter.clients.selftest.run import leased_at, room_on
+from vram_arbiter.schemas.errors import ConfigError
 
 pytestmark = pytest.mark.e2e
 PROGRAM = (sys.executable, "-m", "vram_arbiter.clients", "selftest")
@@ -162,6 +165,20 @@ def test_a_gpu_that_an_arbiter_leases_is_refused(
     assert (leased_at("GPU-stub-0", found), leased_at("GPU-1", found)) == (leasing.endpoint, None)
     leasing.stop()
     assert leased_at("GPU-stub-0", found) is None
+
+
+def test_the_room_is_that_of_one_lease(make_arbiter: Make) -> None:
+    """Of a GPU in MIG mode the daemon leases the instances, under ids of their own."""
+    arbiter = make_arbiter().start()
+
+    async def asked(gpu: str = "") -> int:
+        async with AsyncClient("test", endpoint=arbiter.endpoint) as client:
+            (view,) = (await client.status()).gpus
+            return await room_on(client, gpu or view.gpu)
+
+    assert asyncio.run(asked()) == 8 * GIB - 300 * MIB - 128 * MIB
+    with pytest.raises(ConfigError, match="not GPU-1: is it split into instances"):
+        asyncio.run(asked("GPU-1"))
 
 
 def test_options_are_checked_first(alone: dict[str, str]) -> None:
