@@ -58,6 +58,7 @@ test: setup ## the whole product; ARGS goes to pytest
 	$(BIN)/pytest -q -n $(WORKERS) $(BY_FILE) -m "not gpu and not nightly" $(ARGS)
 
 test-gpu: setup ## what needs an NVIDIA GPU, alone on it; skipped with the reason elsewhere
+	$(BIN)/vramctl selftest
 	$(BIN)/pytest -q -rsP tests/gpu $(ARGS)
 
 test-core: setup-core ## the base install alone, in seconds

@@ -12,16 +12,15 @@ import multiprocessing
 import os
 import socket
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future
 from functools import partial
 from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from typing import Final
 
 from vram_arbiter.schemas.errors import ModelError
+from vram_arbiter.schemas.runtime.threads import in_daemon_thread
 from vram_arbiter.sidecars import model_main
 from vram_arbiter.sidecars.adapters.choose import make_adapter
 from vram_arbiter.sidecars.model_main import THREADS_VARIABLE
@@ -209,7 +208,7 @@ class ModelProcesses:
         try:
             # from this thread: the server ends with the thread that started it (`preload`)
             forkserver.ensure_running()
-            await _in_a_thread(partial(self._fork, process))
+            await in_daemon_thread(partial(self._fork, process), "start a model")
             streams = await asyncio.open_connection(sock=ours)
         except BaseException:
             ours.close()
@@ -239,19 +238,3 @@ def _main_unnamed() -> Iterator[None]:
         main.__spec__ = spec
         if file is not None:
             main.__file__ = file
-
-
-async def _in_a_thread(work: Callable[[], None]) -> None:
-    """Do the work in a thread that the program's end does not wait for."""
-    done: Future[None] = Future()
-    done.set_running_or_notify_cancel()
-
-    def run() -> None:
-        try:
-            work()
-            done.set_result(None)
-        except BaseException as error:  # noqa: BLE001  raised where it is awaited
-            done.set_exception(error)
-
-    threading.Thread(target=run, name="start a model", daemon=True).start()
-    await asyncio.wrap_future(done)

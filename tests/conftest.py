@@ -53,6 +53,7 @@ LONGEST = (
     "tests/runner/sim/test_benchmark.py",
     "tests/bench/",
     "tests/clients/observer/",
+    "tests/clients/selftest/",
     "tests/arbiter/core/test_machine.py",
     "tests/arbiter/test_",
 )

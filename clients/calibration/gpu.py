@@ -34,6 +34,7 @@ class Gpu:
     uuid: str
     name: str
     driver: str
+    total_bytes: int
     device: str
     environ: Mapping[str, str]
     read: Callable[[], Reading]
@@ -81,7 +82,8 @@ def fake_gpu(folder: Path) -> Gpu:
         return Reading(gpu.used_bytes, {one.pid: one.on_gpu_bytes for one in living})
 
     config, environ = state().config, {fakegpu.FOLDER_VARIABLE: str(folder)}
-    return Gpu(config.uuid, config.name, "simulated", f"fake:{folder}", environ, read)
+    total = config.capacity_bytes
+    return Gpu(config.uuid, config.name, "simulated", total, f"fake:{folder}", environ, read)
 
 
 def nvml_gpu(index: int, nvml: Any) -> Gpu:
@@ -100,9 +102,11 @@ def nvml_gpu(index: int, nvml: Any) -> Gpu:
         handle = devices(nvml)[index].handle
         uuid, name = nvml.nvmlDeviceGetUUID(handle), nvml.nvmlDeviceGetName(handle)
         driver = nvml.nvmlSystemGetDriverVersion()
+        total = nvml.nvmlDeviceGetMemoryInfo(handle).total
     except (nvml.NVMLError, IndexError) as error:
         raise NoGpu(f"no NVIDIA driver answers for GPU {index}: {error}", hint=_HINT) from error
-    return Gpu(uuid, name, driver, "cuda", {cuda.VISIBLE: uuid, cuda.ORDER: cuda.PCI}, read)
+    environ = {cuda.VISIBLE: uuid, cuda.ORDER: cuda.PCI}
+    return Gpu(uuid, name, driver, total, "cuda", environ, read)
 
 
 def _listed(nvml: Any, handle: Any) -> dict[int, int] | None:

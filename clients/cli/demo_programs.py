@@ -1,5 +1,5 @@
-"""The demo's programs: started by `python -m`, watched, and ended again. Only processes started
-here are ever signalled."""
+"""Programs of a demo or a self-test: started by `python -m`, watched, and ended again. Only
+processes started here are ever signalled."""
 
 import asyncio
 import os
@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vram_arbiter.clients._protocol import traces
+from vram_arbiter.clients.foreign.program import dying_with_parent
 from vram_arbiter.schemas.errors import SidecarUnavailable
 
 STOP_GRACE_S = 15.0
@@ -45,14 +46,15 @@ class Programs:
     running: dict[str, DemoProgram] = field(default_factory=dict)
 
     async def start(self, name: str, package: str, *arguments: str) -> DemoProgram:
-        """Start `python -m vram_arbiter.PACKAGE ARGUMENTS`; its output goes to
-        `<log_dir>/<name>.log`."""
+        """Start `python -m vram_arbiter.PACKAGE ARGUMENTS`, which dies with this process; its
+        output goes to `<log_dir>/<name>.log`."""
         log = self.log_dir / f"{name}.log"
         with log.open("wb") as sink:
             process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", f"vram_arbiter.{package}", *arguments,
                 stdin=asyncio.subprocess.DEVNULL, stdout=sink, stderr=sink,
                 env=dict(os.environ) | traces.environ() | dict(self.environ),
+                preexec_fn=dying_with_parent(),
             )  # fmt: skip
         program = self.running[name] = DemoProgram(name, process, log)
         return program

@@ -70,6 +70,7 @@ COMMANDS: Mapping[str, Command] = {
         "calibrate", "measure what a model or a program needs, for the footprint file", wraps=True
     ),
     "doctor": Command("doctor", "check the installation, the daemon and its GPUs"),
+    "selftest": Command("selftest", "prove on this machine's GPU what the product claims of it"),
     "install": Command("install", "make the arbiter a service, after showing the plan"),
     "uninstall": Command("install", "remove what `vramctl install` put on this machine"),
     "mcp": Command("mcp", "serve status, why and history to agents"),
@@ -86,7 +87,8 @@ def run_main(argv: Sequence[str]) -> int:
     name, *rest = argv
     chosen = COMMANDS[name]
     module = import_module(f"vram_arbiter.clients.cli.{chosen.module}")
-    as_json = "--json" in _own(rest) and name != "run"  # what follows `run` is another program's
+    # what follows `run` is another program's, and a self-test writes its JSON to a file
+    as_json = "--json" in _own(rest) and name not in ("run", "selftest")
     try:
         with _span(name, traced=chosen.traced) as running:
             if chosen.passes_on:

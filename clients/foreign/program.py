@@ -10,7 +10,7 @@ import contextlib
 import ctypes
 import os
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Protocol, Self
 
 from vram_arbiter.schemas.runtime import procfs
@@ -30,6 +30,20 @@ def adopt_orphans() -> None:
     if _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0):
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
+
+
+def dying_with_parent() -> Callable[[], None]:
+    """Return what a child does before it executes its program (`preexec_fn`), so that it dies with
+    this process."""
+    parent = os.getpid()
+
+    def prepare() -> None:
+        _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGQUIT})
+        if os.getppid() != parent:  # it ended before the call above
+            os._exit(128 + signal.SIGKILL)
+
+    return prepare
 
 
 class Program(Protocol):
@@ -85,16 +99,8 @@ class ForeignProgram:
         """Start it; what it prints goes to the descriptor `out` if one is given. Raises OSError
         where it cannot be executed."""
         others = frozenset(_children().get(os.getpid(), ()))
-        parent = os.getpid()
-
-        def prepare() -> None:  # in the child, before it executes the program
-            _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGQUIT})
-            if os.getppid() != parent:  # it ended before the call above
-                os._exit(128 + signal.SIGKILL)
-
         child = await asyncio.create_subprocess_exec(
-            path, *arguments, env=environ, preexec_fn=prepare, stdout=out
+            path, *arguments, env=environ, preexec_fn=dying_with_parent(), stdout=out
         )
         return cls(child, others)
 
@@ -143,7 +149,7 @@ class ForeignProgram:
                 async with asyncio.timeout(ORPHAN_GRACE_S):
                     while orphans := self._orphans():
                         for pid in orphans - signaled:
-                            _send(pid, number)
+                            send_below(pid, number)
                         signaled |= orphans
                         await asyncio.sleep(ORPHAN_POLL_S)
             ended |= signaled
@@ -182,8 +188,9 @@ def _children() -> dict[int, list[int]]:
     return found
 
 
-def _send(pid: int, number: signal.Signals) -> None:
-    """Signal a process unless it has ended; a process that took its pid is not of the tree."""
+def send_below(pid: int, number: signal.Signals) -> None:
+    """Signal a process of this process's tree by its pidfd, unless it has ended; a process that
+    took its pid is not of the tree."""
     try:
         pidfd = os.pidfd_open(pid)
     except ProcessLookupError:

@@ -133,7 +133,7 @@ def nvml(**changes: Any) -> Any:
         "nvmlDeviceGetUUID": lambda handle: "GPU-1",
         "nvmlDeviceGetName": lambda handle: "Test GPU",
         "nvmlSystemGetDriverVersion": lambda: "600.1",
-        "nvmlDeviceGetMemoryInfo": lambda handle: SimpleNamespace(used=5),
+        "nvmlDeviceGetMemoryInfo": lambda handle: SimpleNamespace(used=5, total=9),
         "nvmlDeviceGetComputeRunningProcesses": lambda handle: [listed(1, 10)],
         "nvmlDeviceGetGraphicsRunningProcesses": lambda handle: [listed(1, 11), listed(3, 5)],
     }

@@ -5,8 +5,10 @@
  *   sensors GPU PERCENT CELSIUS MILLIWATTS                     none without it
  *   late GPU BYTES UNTIL                                       BYTES more are used until UNTIL (CLOCK_MONOTONIC, seconds)
  *   process GPU compute|graphics PID BYTES|na [UNTIL [ID]]     listed until then (inf: for ever), on the GPU instance ID
- *   error CALL CODE                                            CALL: init count memory memory_v2 compute graphics mig
- *   hang CALL                                                  does not return before the line is gone
+ *   error CALL CODE [AFTER]                                    CALL: init count memory memory_v2 compute graphics mig
+ *   hang CALL [AFTER]                                          does not return before the line is gone
+ *
+ * AFTER: so many calls of a process are answered before.
  */
 #include <stdio.h>
 #include <stdlib.h>
@@ -19,7 +21,7 @@
 #define PLACES 7
 #define NO_INSTANCE 0xFFFFFFFFu
 #define NA 0xFFFFFFFFFFFFFFFFull
-enum { SUCCESS = 0, NOT_SUPPORTED = 3, NO_PERMISSION = 4, INSUFFICIENT_SIZE = 7, NOT_FOUND = 6, VERSION_MISMATCH = 25, UNKNOWN = 999 };
+enum { SUCCESS = 0, INVALID_ARGUMENT = 2, NOT_SUPPORTED = 3, NO_PERMISSION = 4, INSUFFICIENT_SIZE = 7, NOT_FOUND = 6, VERSION_MISMATCH = 25, UNKNOWN = 999 };
 
 typedef unsigned long long u64;
 typedef struct { char uuid[96]; u64 total, reserved, used; int mig; unsigned id, sensors[3]; int told; } Gpu; /* or an instance */
@@ -37,7 +39,16 @@ static double now(void) {
     return t.tv_sec + t.tv_nsec / 1e9;
 }
 
-static void look(const char *call, World *world) {
+/* How often this process has made a call, with this time. */
+static int times(const char *call) {
+    static struct { const char *call; int n; } made[16];
+    int i = 0;
+    while (i < 15 && made[i].call && strcmp(made[i].call, call)) i++;
+    made[i].call = call;
+    return ++made[i].n;
+}
+
+static void look(const char *call, int n, World *world) {
     const char *path = getenv("NVML_STUB");
     memset(world, 0, sizeof *world);
     FILE *file = path ? fopen(path, "r") : NULL;
@@ -47,7 +58,7 @@ static void look(const char *call, World *world) {
         Gpu gpu = {0};
         Process process = {.id = NO_INSTANCE};
         u64 count;
-        int index, place, code;
+        int index, place, code, after = 0;
         double until = 1e18;
         if (sscanf(line, "gpu %95s %llu %llu %llu", gpu.uuid, &gpu.total, &gpu.reserved, &gpu.used) == 4) {
             gpu.mig = strstr(line, " mig") != NULL;
@@ -65,10 +76,10 @@ static void look(const char *call, World *world) {
             process.graphics = strcmp(word, "graphics") == 0;
             process.used = strcmp(bytes, "na") == 0 ? NA : strtoull(bytes, NULL, 10);
             if (until > now() && world->n_processes < PROCESSES) world->processes[world->n_processes++] = process;
-        } else if (sscanf(line, "error %95s %d", word, &code) == 2) {
-            if (strcmp(word, call) == 0) world->error = code;
-        } else if (sscanf(line, "hang %95s", word) == 1) {
-            if (strcmp(word, call) == 0) world->hangs = 1;
+        } else if (sscanf(line, "error %95s %d %d", word, &code, &after) >= 2) {
+            if (strcmp(word, call) == 0 && n > after) world->error = code;
+        } else if (sscanf(line, "hang %95s %d", word, &after) >= 1) {
+            if (strcmp(word, call) == 0 && n > after) world->hangs = 1;
         }
     }
     fclose(file);
@@ -76,7 +87,8 @@ static void look(const char *call, World *world) {
 
 /* The world as this call sees it; a nonzero result is the error to return. */
 static int begin(const char *call, World *world) {
-    for (look(call, world); world->hangs; look(call, world)) usleep(10000);
+    int n = times(call);
+    for (look(call, n, world); world->hangs; look(call, n, world)) usleep(10000);
     return world->error;
 }
 
@@ -113,7 +125,12 @@ int nvmlDeviceGetCount_v2(unsigned *count) {
     return error;
 }
 
-int nvmlDeviceGetHandleByIndex_v2(unsigned index, void **handle) { *handle = handle_of(index, -1); return SUCCESS; }
+int nvmlDeviceGetHandleByIndex_v2(unsigned index, void **handle) {
+    World w;
+    int error = begin("handle", &w);
+    *handle = handle_of(index, -1);
+    return error ? error : (int)index < w.n_gpus ? SUCCESS : INVALID_ARGUMENT;
+}
 
 int nvmlDeviceGetHandleByUUID(const char *uuid, void **handle) {
     World w;

@@ -1,0 +1,218 @@
+"""Place of a self-test: one GPU, a private daemon on it, and children that hold bytes.
+
+Children die with this process; no other process is signaled. Must not know what is measured.
+"""
+
+import asyncio
+import json
+import os
+import sys
+import time
+from asyncio.subprocess import PIPE, Process
+from collections.abc import AsyncIterator, Callable, Collection, Mapping
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from signal import SIGKILL
+from typing import Any, Final
+
+from vram_arbiter.clients.calibration.gpu import Gpu, Reading
+from vram_arbiter.clients.cli.demo_programs import Programs
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.configs import configs_folder
+from vram_arbiter.clients.foreign.program import dying_with_parent, send_below
+from vram_arbiter.clients.sidecar.build import CLIENTS
+from vram_arbiter.schemas.defaults import VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
+from vram_arbiter.schemas.errors import ProbeFailed, SidecarUnavailable, from_wire
+from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
+from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.schemas.runtime.threads import in_daemon_thread
+from vram_arbiter.schemas.sizes import format_bytes
+
+READING_S: Final = 5.0
+"""Above the daemon's own limit of a reading (2 s): a GPU that takes longer hangs."""
+POLL_S: Final = 0.002
+END_S: Final = 10.0
+MODEL_S: Final = 90.0
+"""Imports of three sidecars at once, on two busy cores."""
+HOLDER: Final = (sys.executable, "-m", "vram_arbiter.sidecars.holder")
+RUN: Final = (
+    sys.executable, "-m", "vram_arbiter.clients", "run", "--min-residency", "0", "--on-revoke",
+    "term",
+)  # fmt: skip
+
+
+class Skipped(Exception):
+    """A row cannot run here; the text says why."""
+
+
+class Missed(Exception):
+    """A row found something else than the product claims; the text says what."""
+
+
+def need(*packages: str, extra: str) -> None:
+    """Raises Skipped where one of the packages is not installed."""
+    if not all(map(find_spec, packages)):
+        raise Skipped(f"install 'vram-arbiter[{extra}]'")
+
+
+async def answered_within[T](limit_s: float, work: Callable[[], T]) -> T:
+    """Do work of the driver, which may hang. Raises ProbeFailed after `limit_s`."""
+    try:
+        async with asyncio.timeout(limit_s):
+            return await in_daemon_thread(work, "driver")
+    except TimeoutError:
+        late = f"the driver gave no answer within {limit_s:g} s"
+        raise ProbeFailed(late, hint="see nvidia-smi and dmesg") from None
+
+
+@dataclass(slots=True)
+class Holder:
+    """A process of `sidecars.holder`; `process` is it, or the `vramctl run` that started it."""
+
+    process: Process
+    log: Path
+    pid: int = 0
+
+    async def ask(self, word: str, *sizes: int) -> JsonMap:
+        """Raises the process's typed error, and SidecarUnavailable where it has ended."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{' '.join([word, *map(str, sizes)])}\n".encode())
+        return await self.answer()
+
+    async def answer(self) -> JsonMap:
+        """Return its next line; the first one comes unasked. Raises as `ask`."""
+        assert self.process.stdout is not None
+        line = await self.process.stdout.readline()
+        if not line:
+            told = self.log.read_text(errors="replace").splitlines()[-1:]
+            raise SidecarUnavailable(f"a holder ended: {''.join(told)}")
+        answer: JsonMap = json.loads(line)
+        if "error" in answer:
+            raise from_wire(answer["error"])
+        return answer
+
+    async def end(self) -> None:
+        """End it in order, and by force after END_S."""
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self.process.wait(), END_S)
+        await self.kill()
+
+    async def kill(self) -> None:
+        """End it with SIGKILL, if it has not ended; its program dies with it."""
+        if self.process.returncode is None:
+            send_below(self.process.pid, SIGKILL)
+        await self.process.wait()
+
+
+@dataclass(slots=True)
+class Bed:
+    """Where rows are measured. `memory_bytes` is the most that is on the GPU at a time;
+    `lease_bytes` are all that the daemon has, so that one lease excludes another."""
+
+    gpu: Gpu
+    found: Reading  # before all others
+    memory_bytes: int
+    lease_bytes: int
+    programs: Programs
+    client: AsyncClient
+    daemon: tuple[str, ...]  # its arguments
+    skills: Collection[str]  # whose sidecars are needed
+    patience_s: float = VERIFY_TIMEOUT_S  # of memory that is on its way back
+    copies: JsonMap = field(default_factory=dict)
+
+    @property
+    def simulated(self) -> bool:
+        return self.gpu.device.startswith("fake:")
+
+    @property
+    def part_bytes(self) -> int:
+        """Bytes of a holder beside its context."""
+        return self.memory_bytes // 4
+
+    async def read(self) -> Reading:
+        """Raises ProbeFailed."""
+        return await answered_within(READING_S, self.gpu.read)
+
+    async def used(self) -> int:
+        """Return the GPU's used bytes. Raises ProbeFailed."""
+        return (await self.read()).used_bytes
+
+    async def returned(self, used_bytes: int) -> float:
+        """Wait until no more than `used_bytes`, and the tolerance, are used. Return the seconds.
+        Raises Missed after `patience_s`."""
+        began_s = time.monotonic()
+        while (more := await self.used() - used_bytes) > VERIFY_TOLERANCE_BYTES:
+            if time.monotonic() - began_s > self.patience_s:
+                raise Missed(f"{format_bytes(more)} did not return in {self.patience_s:g} s")
+            await asyncio.sleep(POLL_S)
+        return time.monotonic() - began_s
+
+    async def restart_daemon(self) -> None:
+        """Kill the daemon, and start it again on the same files."""
+        process = self.programs.running["arbiter"].process
+        send_below(process.pid, SIGKILL)
+        await process.wait()
+        await self.programs.start("arbiter", "arbiter", *self.daemon)
+
+    @asynccontextmanager
+    async def holder(
+        self, lease: str = "", environ: Mapping[str, str] | None = None
+    ) -> AsyncIterator[Holder]:
+        """Start a process that can hold bytes, and end it again: under a lease of that name
+        (`vramctl run`), or without one, which makes it a stowaway. Its bytes are back at the end of
+        the block.
+
+        Raises Skipped, Missed, SidecarUnavailable.
+        """
+        if not self.simulated:
+            need("torch", extra="sidecars")
+        used_bytes, command = await self.used(), [*HOLDER, self.gpu.device]
+        if lease:
+            need_of = ("--vram", f"{self.lease_bytes}B", "--gpu", self.gpu.uuid, "--name", lease)
+            command = [*RUN, *need_of, "--", *command]
+        path = self.programs.log_dir / "holder.log"
+        with path.open("wb") as log:
+            process = await asyncio.create_subprocess_exec(
+                *command, stdin=PIPE, stdout=PIPE, stderr=log, preexec_fn=dying_with_parent(),
+                env=dict(os.environ) | dict(self.programs.environ) | dict(environ or {}),
+            )  # fmt: skip
+        made = Holder(process, path)
+        try:
+            made.pid = (await made.answer())["pid"]
+            yield made
+        finally:
+            await made.end()
+        await self.returned(used_bytes)
+
+    @asynccontextmanager
+    async def model(self, skill: str) -> AsyncIterator[tuple[Any, RSkillManifest]]:
+        """Make the model of a shipped skill resident, and unload it again. Gives the client of its
+        kind. All sidecars start at first use. Its bytes are back at the end of the block.
+
+        Raises Skipped, Missed, SidecarUnavailable, and the sidecar's errors.
+        """
+        need("torch", "transformers", "lerobot", "PIL", extra="sidecars")
+        manifest = load_manifest(configs_folder(os.environ) / "rskills" / skill / "rskill.yaml")
+        for name in sorted(set(self.skills) - set(self.programs.running)):
+            await self.programs.start(
+                name, "sidecars", "--name", name, "--rskill", name, "--device", self.gpu.device,
+                "--gpu", self.gpu.uuid, "--footprint", str(self.memory_bytes),
+                "--min-residency-s", "0", "--parent", str(os.getpid()),
+            )  # fmt: skip
+        async with CLIENTS[manifest.kind](f"ipc://{self.programs.log_dir}/{skill}.sock") as client:
+            try:
+                await client.ping(timeout_s=MODEL_S)
+            except SidecarUnavailable:
+                self.programs.check()  # says why it ended
+                raise
+            used_bytes = await self.used()
+            await client.load()
+            try:
+                yield client, manifest
+            finally:
+                await client.unload()
+            await self.returned(used_bytes)

@@ -1,0 +1,194 @@
+"""A process with bytes on a GPU that does what its parent says, for `vramctl selftest`.
+
+`python -m vram_arbiter.sidecars.holder fake:FOLDER|cuda[:N]|none` reads one request a line from
+stdin, a word and sizes in bytes, and answers each with one JSON object on stdout. It ends with its
+input. Must not know leases.
+"""
+
+import json
+import os
+import signal
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from vram_arbiter.schemas.defaults import MIB
+from vram_arbiter.schemas.errors import ModelError, VramError
+from vram_arbiter.schemas.plain import JsonMap
+from vram_arbiter.sidecars.device.fake import FakeMemory
+from vram_arbiter.sidecars.device.memory import Block, DeviceMemory, fill
+from vram_arbiter.sidecars.host_weights import HostWeights
+from vram_arbiter.sidecars.parent import end_with
+
+PIECE_BYTES: Final = 16 * MIB
+REPEATS: Final = 5
+WIDTH: Final = 1024
+NF4: Final = {"compute_dtype": "float32", "min_params_to_quantize": 0, "skip_modules": []}
+"""In float32, CPU and GPU differ by the order of additions alone."""
+
+
+class Holder:
+    """Bytes of this process. Requests raise OutOfMemory, and what their libraries raise."""
+
+    _memory: DeviceMemory
+
+    def __init__(self) -> None:
+        self._blocks: list[Block] = []
+        self._numbers: Any = None
+
+    def begin(self, device: str) -> JsonMap:
+        """Open the device: the first request, by the program's argument. Raises NoGpu."""
+        self._memory = _open(device)
+        return {"pid": os.getpid()}
+
+    def fill(self, size_bytes: int) -> JsonMap:
+        """Make the context, and allocate beside it."""
+        self._memory.touch()
+        self._blocks += fill(self._memory, "weights", size_bytes, bytes_per_s=None)
+        return {}
+
+    def free(self) -> JsonMap:
+        """Give everything but the context back to the driver."""
+        while self._blocks:
+            self._memory.free(self._blocks.pop())
+        self._memory.empty_cache()
+        return {}
+
+    def number(self, size_bytes: int) -> JsonMap:
+        """Write a number to each eight bytes of a tensor, whose sum `sum` tells."""
+        import torch
+
+        self._memory.touch()
+        self._numbers = torch.arange(size_bytes // 8, device=self._memory.torch_device)
+        return self.sum()
+
+    def sum(self) -> JsonMap:
+        """Add the numbers up, on the GPU."""
+        return {"sum": int(self._numbers.sum())}
+
+    def copies(self, size_bytes: int) -> JsonMap:
+        """Time copies of weights from host RAM, in a process that is forked as a model's is: the
+        weights lie in memory that both share (`host_weights`). The first request, if at all: a
+        context does not survive the fork."""
+        import torch
+
+        torch.set_num_threads(1)  # a fork copies no other thread
+        pieces = [torch.ones(PIECE_BYTES // 4) for _ in range(size_bytes // PIECE_BYTES)]
+        network = torch.nn.ParameterList(pieces).requires_grad_(False)
+        weights = HostWeights([network], "selftest")
+        return _forked(lambda: self._timed_copies(network, weights))
+
+    def _timed_copies(self, network: Any, weights: HostWeights) -> JsonMap:
+        """Seconds of the first copy of a sidecar's weights, and medians of plain copies, each one
+        `cudaMemcpyAsync` of all bytes and a synchronization: from ordinary and from page-locked
+        memory."""
+        import torch
+
+        self._memory.touch()
+        device, on_cpu = self._memory.torch_device, self._memory.torch_device == "cpu"
+        restore = weights.own if on_cpu else lambda: network.to(device)
+        answer = {"bytes": weights.size_bytes, "restore_s": self._seconds(restore)}
+        plain = torch.ones(weights.size_bytes, dtype=torch.uint8)
+        there = plain.to(device, copy=True)  # the allocator has room from here on
+        sources = {"pageable_s": plain} | ({} if on_cpu else {"page_locked_s": plain.pin_memory()})
+        for name, source in sources.items():
+            times = [self._seconds(partial(there.copy_, source)) for _ in range(REPEATS)]
+            answer[name] = statistics.median(times)
+        return answer
+
+    def _seconds(self, work: Callable[[], object]) -> float:
+        self._memory.empty_cache()  # waits for the GPU
+        began_s = time.perf_counter()
+        work()
+        if self._memory.torch_device != "cpu":
+            import torch
+
+            torch.cuda.synchronize()
+        return time.perf_counter() - began_s
+
+    def nf4(self) -> JsonMap:
+        """Quantize two linear layers in host RAM, and compare their answer there with that of the
+        same bytes on the GPU. `difference` is relative."""
+        import torch
+
+        from vram_arbiter.schemas.manifest import RSkillManifest
+        from vram_arbiter.schemas.manifest.contracts import Quantization
+        from vram_arbiter.sidecars.quantization import quantize_linear
+
+        # of a manifest, only this is read
+        asked = Quantization.model_validate({"dtype": "int4", "extra": NF4})
+        fields: dict[str, Any] = {"name": "selftest", "quantization": asked}
+        manifest = RSkillManifest.model_construct(**fields)
+        torch.manual_seed(0)
+        layers = (torch.nn.Linear(WIDTH, WIDTH, bias=False) for _ in range(2))
+        network = torch.nn.Sequential(*layers).eval().requires_grad_(False)
+        before = _size(network)
+        quantize_linear(network, manifest)
+        values, device = torch.ones(1, WIDTH), self._memory.torch_device
+        with torch.inference_mode():
+            here = network(values)
+            self._memory.touch()
+            there = network.to(device)(values.to(device)).cpu()
+        difference = float((there - here).norm() / here.norm())
+        return {"bytes": _size(network), "of_bytes": before, "difference": difference}
+
+
+def _open(device: str) -> DeviceMemory:
+    if device.startswith("fake:"):
+        return FakeMemory(Path(device.removeprefix("fake:")), "selftest")
+    if device == "none":
+        return DeviceMemory()
+    from vram_arbiter.sidecars.device.cuda import CudaMemory
+
+    index = device.partition(":")[2]
+    return CudaMemory(int(index) if index else None)
+
+
+def _size(network: Any) -> int:
+    return sum(one.numel() * one.element_size() for one in network.parameters())
+
+
+def _forked(work: Callable[[], JsonMap]) -> JsonMap:
+    """Do the work in a fork of this process. Raises ModelError where it ends without an answer."""
+    read, write = os.pipe()
+    parent = os.getpid()
+    if os.fork() == 0:
+        end_with(parent)
+        os.write(write, json.dumps(_answer(work)).encode())
+        os._exit(0)
+    os.close(write)
+    with os.fdopen(read) as pipe:
+        told = pipe.read()
+    _, status = os.wait()
+    if not told:
+        raise ModelError(f"the fork ended with {os.waitstatus_to_exitcode(status)}")
+    found: JsonMap = json.loads(told)
+    return found
+
+
+def _answer(work: Callable[[], JsonMap]) -> JsonMap:
+    """Any failure is an answer."""
+    try:
+        return work()
+    except VramError as error:
+        return {"error": error.to_wire()}
+    except Exception as error:  # noqa: BLE001
+        return {"error": ModelError(f"{type(error).__name__}: {error}").to_wire()}
+
+
+def main() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
+    holder = Holder()
+    print(json.dumps(_answer(partial(holder.begin, sys.argv[1]))), flush=True)
+    for line in sys.stdin:
+        word, *sizes = line.split()
+        request = getattr(holder, word)
+        print(json.dumps(_answer(partial(request, *map(int, sizes)))), flush=True)
+
+
+if __name__ == "__main__":
+    main()
