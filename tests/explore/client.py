@@ -247,7 +247,7 @@ class Client:
 
     def check(self, core: Core) -> None:
         """1. What is in use stays, unless its time to live ran out. 2. When all messages are heard,
-        client and engine agree on what it holds and waits for."""
+        client and engine agree on what it holds, whether it may stay, and what it waits for."""
         lease, ended = core.leases.get(self.lease), core.ended.get(self.lease)
         if self.does == "uses" and not self.over:  # 1
             expired = ended is not None and ended.state is LeaseState.EXPIRED
@@ -258,6 +258,9 @@ class Client:
         for record in self.protocol.holdings.held.values():
             if lease is None or lease.token != record.token or lease.state not in EXPIRING:
                 raise Broken(f"{self.name} believes that it holds {record.lease_id}")
+            leaves = record.revoke is not None and not record.withdrawn
+            if lease.state in USABLE and leaves != (lease.state is LeaseState.REVOKING):
+                raise Broken(f"{self.name} believes of {lease.id}, {lease.state}: revoked {leaves}")
         for waiter in self.protocol.waits.waiters.values():
             if waiter.lease_id not in core.waiting:
                 raise Broken(f"{self.name} waits for {waiter.lease_id}, and the engine does not")

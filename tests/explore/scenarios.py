@@ -28,6 +28,21 @@ HELD = "acquire a, send a, hear a, load a, ready a, send a, hear a"
 REVOKED = f"{HELD}, acquire b, send b"
 """One client holds, another one waits, and neither has heard of it."""
 EVICTED = "acquire a, load a, ready a, read GPU-0, acquire b"
+"""One client is asked to leave for another one."""
+
+
+def evicted(fault: str) -> Scenario:
+    """Return the world in which one fault happens during an eviction."""
+    how: Mapping[str, Any] = {"acquires": 2, "after": EVICTED, "lags": True}
+    return Scenario(f"evicted-{fault}", (BIG, PEAKY), faults={fault: 1}, **how)
+
+
+def revoked(fault: str) -> Scenario:
+    """Return the world in which one fault happens while the clients hear of an eviction."""
+    how: Mapping[str, Any] = {"after": REVOKED, "talks": True}
+    return Scenario(f"revoked-{fault}", (BACK, TALKS), faults={fault: 1}, **how)
+
+
 SCENARIOS: Mapping[str, Scenario] = {
     one.name: one
     for one in (
@@ -38,10 +53,7 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario("standby", (RETURNS, BIG), acquires=2),
         Scenario("restart", (BIG, PEAKY), faults={"restart": 1, "crash": 1}),
         Scenario("readings", (BIG, BIG), faults={"late": 1, "fail": 1, "lie": 1}),
-        *(
-            Scenario(f"evicted-{fault}", (BIG, PEAKY), 1, 2, EVICTED, faults={fault: 1}, lags=True)
-            for fault in ("crash", "late", "fail", "lie", "restart", "cancel")
-        ),
+        *map(evicted, ("crash", "late", "fail", "lie", "restart", "cancel")),
         Scenario("blind", (HALF, HALF), acquires=2, lists=False, lags=True),
         Scenario("talk", (TALKS,), faults={"drop": 2}, talks=True),
         Scenario("talk-turns", (TALKS, TALKS), faults={"drop": 1}, talks=True),
@@ -49,12 +61,7 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario(
             "talk-timeout", (TALKS, TALKS), wait_timeout_s=3.0, faults={"drop": 1}, talks=True
         ),
-        *(
-            Scenario(
-                f"revoked-{fault}", (BACK, TALKS), 1, 1, REVOKED, faults={fault: 1}, talks=True
-            )
-            for fault in ("drop", "cancel", "crash", "restart")
-        ),
+        *map(revoked, ("drop", "cancel", "crash", "restart")),
         Scenario("three", (BIG, BIG, BIG)),
         Scenario("kinds", (BIG, PEAKY, ALONE), faults={"crash": 1}),
         Scenario("two-gpus", (BIG, BIG, BIG), gpus=2),
