@@ -40,8 +40,8 @@ _LEFT_OUT_BECAUSE: Mapping[str, str] = {
     "it is written elsewhere, or a sum": "request spec id key info queue readings residents left"
     " verifications touched debts dirty blocked account leased_bytes leased_approved_bytes"
     " total_bytes budget_bytes tolerance_bytes",
-    "it is a number, or words": "story nonce arrival arrived_at uid reason traceparent label began_at"
-    " failure name consumer model earlier_nonces",
+    "it is a number, or words": "story nonce arrival arrived_at uid reason traceparent label"
+    " began_at failure name consumer model earlier_nonces",
     "it is learned, or told alone": "grew_at drifted reading_s evicted charge_bytes held_from"
     " unloading_at released_at verdict_at wait_timeout_s",
     "it is of the protocol, and never changes": "foreign_uses _above _hello _connection _holdings"

@@ -50,7 +50,7 @@ def opens(root: Path, pid: int, descriptor: int, place: str, client: int, *said:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Two AMD GPUs, listed against their order on the bus; init, and a program with another file."""
+    """Two AMD GPUs, listed against their order on the bus; init and a program with another file."""
     card(
         tmp_path, "card0", SECOND, mem_info_vram_total=16 * GIB, mem_info_vram_used=0,
     )  # fmt: skip
