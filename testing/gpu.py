@@ -99,7 +99,11 @@ class FakeGpu:
 
     @contextlib.contextmanager
     def edited(self, **changes: object) -> Iterator[None]:
-        """`edit` for a block, such as `edited(probe="fail")`."""
+        """`edit` for a block, such as `edited(probe="fail")`.
+
+        A reading from before counts for up to 2 s more: to see what follows from a fault, wait for
+        its event (`probe_failed`) first.
+        """
         before = self.edit(**changes)
         try:
             yield

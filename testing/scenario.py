@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from vram_arbiter.clients.cli.status import all_pages
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.fakegpu import RELEASE_LAG_S
@@ -169,6 +170,16 @@ class _Player:
         self.consumers[name].tell(word)
         eventually(heard, self.scenario.within_s)
 
+    def stowaway(self, size: int) -> None:
+        """Put bytes there, and wait until the daemon knows: a reading from before would grant."""
+        self.undo.enter_context(self.gpu.stowaway(size))
+
+        def known() -> bool:
+            (gpu,) = all_pages(self._arbiter.endpoint)["gpus"]
+            return bool(gpu["stowaway_bytes"] >= size)
+
+        eventually(known)
+
     def expect(self, states: Mapping[str, str]) -> None:
         for name, state in states.items():
             self.consumers[name].reached(state, self.scenario.within_s)
@@ -180,7 +191,7 @@ _ACTIONS: Final[Mapping[str, Callable[[_Player, Any], object]]] = {
     "idle": lambda player, name: player.tell(name, "idle", 0),
     "stop": lambda player, name: player.consumers[name].wait(player.scenario.within_s),
     "kill": lambda player, name: player.consumers[name].stop(SIGKILL),
-    "stowaway": lambda player, size: player.undo.enter_context(player.gpu.stowaway(size)),
+    "stowaway": _Player.stowaway,
     "expect": _Player.expect,
     "evicted_once": lambda player, name: player.timeline.evicted_once(name),
     "granted_before": lambda player, names: player.timeline.granted_before(*names),

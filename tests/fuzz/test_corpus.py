@@ -4,6 +4,8 @@ import tracemalloc
 
 import pytest
 
+pytest.importorskip("aiohttp", reason="needs the full install")
+
 from tests.fuzz.targets import CORPUS, TARGETS, play
 
 pytestmark = pytest.mark.heavy
@@ -19,8 +21,11 @@ def test_each_target_has_a_corpus() -> None:
 @pytest.mark.parametrize("name", TARGETS)
 def test_the_corpus_breaks_nothing(name: str) -> None:
     inputs = [path.read_bytes() for path in sorted((CORPUS / name).iterdir())]
-    for data in inputs:
-        play(TARGETS[name], data)  # whatever is made once is made now
+    for data in inputs:  # whatever is imported or made once is now
+        try:
+            TARGETS[name].run(data)
+        except TARGETS[name].refuses:
+            pass
     tracemalloc.start()
     try:
         for data in inputs:

@@ -51,8 +51,9 @@ def test_it_survives_the_arbiter(arbiter, consumer, timeline, eventually):
     eventually(lambda: "nothing in bin 1" in running.output)
 
 
-def test_it_waits_until_the_gpu_can_be_read(fake_gpu, consumer):
+def test_it_waits_until_the_gpu_can_be_read(fake_gpu, consumer, timeline, eventually):
     with fake_gpu.edited(probe="fail"):
+        eventually(lambda: timeline.events("probe_failed"))  # a reading from before may still grant
         running = consumer("detector", detector)
         running.reached("queued")
     running.reached("held")
