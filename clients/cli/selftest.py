@@ -13,7 +13,7 @@ from vram_arbiter.clients.cli.replies import NO, OK
 from vram_arbiter.clients.selftest import report
 from vram_arbiter.clients.selftest.bed import READING_S, answered_within
 from vram_arbiter.clients.selftest.rows import ROWS
-from vram_arbiter.clients.selftest.run import Result, Wanted, selftest
+from vram_arbiter.clients.selftest.run import Order, Result, selftest
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.printable import printable
@@ -73,7 +73,7 @@ async def _run(args: argparse.Namespace) -> list[Result]:
         print("\n".join(terminal.folded(line, 4, terminal.columns())), flush=True)
 
     rows = [row for row in ROWS if args.row is None or row.id in args.row]
-    results = await selftest(Wanted(index, args.memory, args.within, rows), begun, tell)
+    results = await selftest(Order(index, args.memory, args.within, rows), begun, tell)
     told = report.told(gpus[0], results, simulated=simulated)
     print(told["summary"])
     for place, written in ((args.json, report.as_json), (args.report, report.as_markdown)):

@@ -51,8 +51,9 @@ TOLERANCE: Final = {"source": "verify.tolerance_bytes", "most": VERIFY_TOLERANCE
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """One claim. The figure is to be `most` at the most, or `least` at the least, by `source`.
+class Claim:
+    """What a row measures. Its figure is to be `most` at the most, or `least` at the least, by
+    `source`.
 
     `hardware`: cannot run on a simulated GPU. `skill`: whose sidecar it needs. `timed_model`: on a
     simulated GPU the figure is the CPU's, and has no limit.
@@ -76,7 +77,7 @@ class Row:
         return f"{bound} {self.unit}".rstrip()
 
 
-ROWS: Final[list[Row]] = []
+ROWS: Final[list[Claim]] = []
 """In the order in which they are measured."""
 
 
@@ -86,7 +87,7 @@ def row(unit: str, **fields: Any) -> Callable[[Measure], Measure]:
     def made(measure: Measure) -> Measure:
         what = (measure.__doc__ or "").partition(".")[0].removeprefix("Measure the ")
         name = measure.__name__.replace("_", "-")
-        ROWS.append(Row(name, what, measure, unit, **fields))
+        ROWS.append(Claim(name, what, measure, unit, **fields))
         return measure
 
     return made

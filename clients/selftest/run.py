@@ -17,7 +17,7 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.link import is_listening
 from vram_arbiter.clients.net.request import ask
 from vram_arbiter.clients.selftest.bed import READING_S, Bed, Missed, Skipped, answered_within
-from vram_arbiter.clients.selftest.rows import BEAT_S, LAST, Row
+from vram_arbiter.clients.selftest.rows import BEAT_S, LAST, Claim
 from vram_arbiter.schemas.defaults import RESERVE_BYTES, VERIFY_TOLERANCE_BYTES
 from vram_arbiter.schemas.errors import (
     ArbiterUnreachable,
@@ -36,13 +36,13 @@ SIMULATED: Final = "fake:8GiB"
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class Order:
     """What is asked for. `index` None: a simulated GPU."""
 
     index: int | None
     memory_bytes: int
     within_s: float
-    rows: Sequence[Row]
+    rows: Sequence[Claim]
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Result:
 
 
 async def selftest(
-    wanted: Wanted, begun: Callable[[Gpu], None], tell: Callable[[Result], None]
+    wanted: Order, begun: Callable[[Gpu], None], tell: Callable[[Result], None]
 ) -> list[Result]:
     """Measure all rows, and tell each result as it comes; `begun` is told the GPU before.
 
@@ -71,7 +71,7 @@ async def selftest(
     deadline_s = time.monotonic() + wanted.within_s
     results: list[Result] = []
 
-    async def judge(row: Row, bed: Bed, left_s: float) -> None:
+    async def judge(row: Claim, bed: Bed, left_s: float) -> None:
         results.append(await judged(row, bed, left_s))
         tell(results[-1])
 
@@ -86,7 +86,7 @@ async def selftest(
 
 
 @asynccontextmanager
-async def _made(wanted: Wanted, folder: str) -> AsyncIterator[Bed]:
+async def _made(wanted: Order, folder: str) -> AsyncIterator[Bed]:
     """Read the GPU, and start a daemon on it; end that and all other children with the block."""
     gpu, found = await _open(wanted)
     endpoint = f"ipc://{folder}/arbiter.sock"
@@ -113,7 +113,7 @@ async def _made(wanted: Wanted, folder: str) -> AsyncIterator[Bed]:
         await programs.stop_all()
 
 
-async def _open(wanted: Wanted) -> tuple[Gpu | None, Reading | None]:
+async def _open(wanted: Order) -> tuple[Gpu | None, Reading | None]:
     """Open a real GPU and read it, if it may be used; the daemon makes a simulated one. Raises
     ConfigError, NoGpu, ProbeFailed."""
     if wanted.index is None:
@@ -167,7 +167,7 @@ async def room_on(client: AsyncClient, gpu: str) -> int:
         await asyncio.sleep(BEAT_S)
 
 
-async def judged(row: Row, bed: Bed, left_s: float) -> Result:
+async def judged(row: Claim, bed: Bed, left_s: float) -> Result:
     """Measure one row in `left_s` at most. Never raises: a row that fails hides no other."""
     limit = "" if row.timed_model and bed.simulated else row.limit
     began_s, limit_s = time.monotonic(), min(row.limit_s, left_s)

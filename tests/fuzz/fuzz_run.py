@@ -26,9 +26,9 @@ def hunt_here(name: str, options: Sequence[str]) -> None:
     import atheris
 
     with atheris.instrument_imports(include=["vram_arbiter"]):
-        from tests.fuzz.targets import CORPUS, TARGETS, play
+        from tests.fuzz.targets import CORPUS, TARGETS, try_input
 
-        target = functools.partial(play, TARGETS[name])
+        target = functools.partial(try_input, TARGETS[name])
         for path in (CORPUS / name).iterdir():  # functions import, too
             target(path.read_bytes())
     atheris.Setup([sys.argv[0], *options], target)

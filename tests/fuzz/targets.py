@@ -1,7 +1,7 @@
 """Parsers of bytes that another user, machine or program wrote, in one table.
 
 A target takes any bytes. It may raise the typed errors that its callers answer; anything else, and
-more processor time than `play` allows, is a finding. `corpus/NAME/` has bytes of each target, all
+more processor time than `try_input` allows, is a finding. `corpus/NAME/` has bytes of each target, all
 made here: whole messages, known attacks, and what once broke a target.
 """
 
@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.support.deployment import load_robot
+from tests.support.hostile import code_of
 from tests.support.paths import CONFIGS
 from vram_arbiter.arbiter.eventlog.logfile import LogError, read_file
 from vram_arbiter.arbiter.host.records import record_of
 from vram_arbiter.arbiter.host.seal import Seal, read_last_start
-from vram_arbiter.arbiter.rpc import codec
 from vram_arbiter.clients.net.server import parsed
 from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.runner.goals.server import OPS, RUNNER_REQUEST
@@ -25,7 +25,6 @@ from vram_arbiter.schemas import estop, strictjson
 from vram_arbiter.schemas.config.arbiter import load_config
 from vram_arbiter.schemas.config.gateway import load_gateway, load_keys
 from vram_arbiter.schemas.config.observer import load_observer
-from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.errors import BadFrame, CallerError, ConfigError, SidecarUnavailable
 from vram_arbiter.schemas.manifest import (
     ManifestError,
@@ -45,7 +44,6 @@ CORPUS = Path(__file__).with_name("corpus")
 LIMIT_S = 0.25
 LIMIT_S_PER_BYTE = 20e-6
 """Processor time of one input: 0.25 s, and 20 s for each MB."""
-ANSWER_MAX_BYTES = 16_384
 LIMITS = UnpackLimits(values_max=1000)
 ASKED = lerobot.Instructions("me/pick", ("a", "b"), {"observation.images.front": "front"}, 10)
 MODEL_OPS = frozenset({"get_action", "reset", "detect", "query", "score"})
@@ -59,7 +57,7 @@ class Target:
     refuses: type[Exception] | tuple[type[Exception], ...]
 
 
-def play(target: Target, data: bytes) -> None:
+def try_input(target: Target, data: bytes) -> None:
     """Give a target bytes. Raises what is a finding."""
     began = time.process_time()
     try:
@@ -77,14 +75,6 @@ def zmtp(data: bytes) -> None:
         while connection.next_event() is not None:
             connection.outgoing()
         assert connection.kept_bytes <= 1000 + len(part)
-
-
-def request(data: bytes) -> None:
-    try:
-        codec.decode(data, MESSAGE_MAX_BYTES)
-    except codec.Undecodable as bad:
-        answer = codec.refusal(bad.request_id, 1, bad.error.view())
-        assert len(answer) <= ANSWER_MAX_BYTES, "it echoes what it refuses at length"
 
 
 def stop(data: bytes) -> None:
@@ -152,7 +142,7 @@ def a_manifest() -> RSkillManifest:
 
 TARGETS: Mapping[str, Target] = {
     "zmtp": Target(zmtp, ZmtpError),
-    "request": Target(request, ()),
+    "request": Target(code_of, ()),
     "sidecar-request": Target(lambda data: parse(unpack_map(data, LIMITS), MODEL_OPS), CallerError),
     "goal-request": Target(
         lambda data: parsed(unpack_map(data, LIMITS), RUNNER_REQUEST, OPS), CallerError

@@ -13,6 +13,8 @@ from typing import Any
 
 import msgpack
 
+from vram_arbiter.arbiter.rpc import codec
+from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 from vram_arbiter.schemas.export import definitions
 from vram_arbiter.schemas.wire import requests, spec
 
@@ -21,6 +23,7 @@ _BY_OP: Mapping[str, Mapping[str, Any]] = {
     op: _SCHEMA[cls.__name__] for op, cls in requests.REQUESTS.items()
 }
 OPS = tuple(requests.REQUESTS)
+ANSWER_MAX_BYTES = 16_384
 OPTIONAL = 0.4  # of the fields that may be left out, how many are there
 
 BOMBS: Mapping[str, bytes] = {
@@ -192,3 +195,14 @@ def pack(value: Any) -> bytes:
     """msgpack of anything that a mutant may hold."""
     packed: bytes = msgpack.packb(value, strict_types=False, unicode_errors="surrogatepass")
     return packed
+
+
+def code_of(frame: bytes) -> str:
+    """`ok`, or the code of the error; anything else that is raised fails the test."""
+    try:
+        codec.decode(frame, MESSAGE_MAX_BYTES)
+    except codec.Undecodable as bad:
+        answer = codec.refusal(bad.request_id, 1, bad.error.view())
+        assert len(answer) <= ANSWER_MAX_BYTES, "a refusal never echoes what it refuses at length"
+        return bad.error.code
+    return "ok"

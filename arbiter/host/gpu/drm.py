@@ -3,8 +3,8 @@ library, no context.
 
 Totals are the driver's own. Bytes per process are in the fdinfo of each file of a GPU that a
 process has open (kernel, Documentation/gpu/drm-usage-stats.rst). Those are shown to the process's
-user and to CAP_SYS_PTRACE: a list with a gap would call a process's bytes nobody's, so it is
-unknown unless every process can be looked at.
+user and to CAP_SYS_PTRACE: with a gap in the list a process's bytes would have no owner, so the
+list is unknown unless every process can be looked at.
 """
 
 import ctypes

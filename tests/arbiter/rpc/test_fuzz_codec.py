@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from pydantic import ValidationError
 
 from tests.support.costly import COSTLY
-from tests.support.hostile import BOMBS, Forger, pack
+from tests.support.hostile import ANSWER_MAX_BYTES, BOMBS, Forger, code_of, pack
 from vram_arbiter.arbiter.rpc import codec
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES, MIB, VALUES_MAX
 from vram_arbiter.schemas.errors import MessageTooLarge
@@ -18,20 +18,8 @@ from vram_arbiter.schemas.ids import RequestId
 from vram_arbiter.schemas.runtime.msgpack_codec import count_values
 from vram_arbiter.schemas.wire.requests import REQUESTS, Bye, Envelope
 
-ANSWER_MAX_BYTES = 16_384
 RANDOM = st.randoms(use_true_random=False)
 SETTINGS = settings(deadline=None, suppress_health_check=list(HealthCheck))
-
-
-def code_of(frame: bytes) -> str:
-    """`ok`, or the code of the error; anything else that is raised fails the test."""
-    try:
-        codec.decode(frame, MESSAGE_MAX_BYTES)
-    except codec.Undecodable as bad:
-        answer = codec.refusal(bad.request_id, 1, bad.error.view())
-        assert len(answer) <= ANSWER_MAX_BYTES, "a refusal never echoes what it refuses at length"
-        return bad.error.code
-    return "ok"
 
 
 @SETTINGS

@@ -37,12 +37,12 @@ def bed(tmp_path: Path) -> Bed:
     return bed_on(fake_gpu(tmp_path / "gpu"), tmp_path)
 
 
-def row(measure: Any, **fields: Any) -> rows.Row:
+def row(measure: Any, **fields: Any) -> rows.Claim:
     given = {"id": "r", "what": "w", "unit": "ms", "source": "s", "most": 5.0, **fields}
-    return rows.Row(measure=measure, **given)
+    return rows.Claim(measure=measure, **given)
 
 
-def row_of(name: str) -> rows.Row:
+def row_of(name: str) -> rows.Claim:
     (found,) = [row for row in rows.ROWS if row.id == name]
     return found
 
@@ -83,7 +83,7 @@ async def endless(bed: Bed) -> rows.Found:
     ],
 )
 def test_a_row_ends_in_one_verdict(
-    bed: Bed, one: rows.Row, left_s: float, verdict: str, remark: str
+    bed: Bed, one: rows.Claim, left_s: float, verdict: str, remark: str
 ) -> None:
     """None that did not run is passed; a model's time on a simulated GPU is the CPU's."""
     result = asyncio.run(judged(one, bed, left_s))

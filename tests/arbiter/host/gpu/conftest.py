@@ -1,11 +1,14 @@
 """A `libnvidia-ml.so.1` that answers from a text file: the real `pynvml` loads it in a process of
 its own."""
 
+import json
+import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,6 +25,21 @@ def compiled(source: str, library: Path) -> Path:
     command = [compiler, "-shared", "-fPIC", "-O1", "-o", str(library), str(HERE / source)]
     subprocess.run(command, check=True)
     return library
+
+
+def answer_of_child(code: str, *arguments: str, environ: Mapping[str, str], text: str = "") -> Any:
+    """Return what a child process that runs `code` prints as JSON."""
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        env={**os.environ, **environ},
+        input=text,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
 
 
 @pytest.fixture(scope="session")

@@ -1,15 +1,13 @@
 """GPUs of AMD and Intel, from files laid out as the kernel lays them out below another root; `xe`
 through a compiled `ioctl`."""
 
-import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.arbiter.host.gpu.conftest import answer_of_child
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.arbiter.core.settings import Settings
@@ -129,7 +127,7 @@ def test_a_process_without_a_lease_is_a_stowaway(root: Path) -> None:
 
 
 def test_a_list_with_a_gap_is_no_list(root: Path) -> None:
-    """Bytes that a process hides would seem to be nobody's. One that ended meanwhile has none."""
+    """Bytes that a process hides would have no owner. One that ended meanwhile has none."""
     assert processes(root) == []
     (root / "proc" / "500").mkdir()
     assert processes(root) == []
@@ -182,21 +180,12 @@ except VramError as error:
 """
 
 
-def answer_of_child(xe_library: Path, root: Path) -> Any:
-    done = subprocess.run(
-        [sys.executable, "-c", XE, str(root)],
-        env={**os.environ, "LD_PRELOAD": str(xe_library)},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+def asked_of_xe(library: Path, root: Path) -> Any:
+    return answer_of_child(XE, str(root), environ={"LD_PRELOAD": str(library)})
 
 
 def test_xe_tells_its_memory_by_ioctl(tmp_path: Path, xe_library: Path) -> None:
-    """Main memory is no part of it, and two tiles are one GPU. Nothing used is what the driver says
+    """Main memory does not count, and two tiles are one GPU. Nothing used is what the driver says
     to those that it does not tell."""
     folder = card(tmp_path, "card0", FIRST, driver="xe")
     (folder / "drm" / "renderD128").mkdir(parents=True)
@@ -204,14 +193,14 @@ def test_xe_tells_its_memory_by_ioctl(tmp_path: Path, xe_library: Path) -> None:
     opens(tmp_path, 1, 4, FIRST, 3, *said)
     node = {"dev/dri/renderD128": f"0 {64 * GIB} {GIB}\n1 {8 * GIB} {GIB}\n1 {8 * GIB} {MIB}"}
     write(tmp_path, node)
-    assert answer_of_child(xe_library, tmp_path) == [
+    assert asked_of_xe(xe_library, tmp_path) == [
         f"PCI-{FIRST}", 16 * GIB, GIB + MIB, 16 * GIB, [[1, 6 * MIB]],
     ]  # fmt: skip
     write(tmp_path, {"dev/dri/renderD128": f"0 {64 * GIB} 0\n1 {8 * GIB} 0"})
-    assert "needs CAP_PERFMON" in answer_of_child(xe_library, tmp_path)
+    assert "needs CAP_PERFMON" in asked_of_xe(xe_library, tmp_path)
     write(tmp_path, {"dev/dri/renderD128": f"0 {64 * GIB} 0"})
-    assert "has memory of its own" in answer_of_child(xe_library, tmp_path), "integrated"
+    assert "has memory of its own" in asked_of_xe(xe_library, tmp_path), "integrated"
     (tmp_path / "dev" / "dri" / "renderD128").unlink()
-    assert "No such file" in answer_of_child(xe_library, tmp_path)
+    assert "No such file" in asked_of_xe(xe_library, tmp_path)
     (folder / "drm" / "renderD128").rmdir()
-    assert f"memory of {FIRST} cannot be read" in answer_of_child(xe_library, tmp_path)
+    assert f"memory of {FIRST} cannot be read" in asked_of_xe(xe_library, tmp_path)

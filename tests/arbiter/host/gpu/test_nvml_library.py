@@ -1,15 +1,13 @@
 """The NVML reader through the real `pynvml` and a compiled library: structs, versions, N/A fields
 and error codes as they really arrive."""
 
-import json
 import os
-import subprocess
-import sys
 import textwrap
 from typing import Any
 
 import pytest
 
+from tests.arbiter.host.gpu.conftest import answer_of_child
 from tests.support.nvml_stub import GIB, MIB, NvmlStub
 
 pytest.importorskip("pynvml")
@@ -99,19 +97,10 @@ LOST = """
 """
 
 
-def answer_of_child(stub: NvmlStub, code: str, text: str = "") -> Any:
-    """What a child process prints as JSON that runs `code` with the stub's library."""
-    done = subprocess.run(
-        [sys.executable, "-c", "import json, os, sys\n" + textwrap.dedent(code)],
-        env={**os.environ, **stub.environ},
-        input=text,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+def answer_of(stub: NvmlStub, code: str, text: str = "") -> Any:
+    """Return what `code` prints with the stub's library."""
+    code = "import json, os, sys\n" + textwrap.dedent(code)
+    return answer_of_child(code, environ=stub.environ, text=text)
 
 
 def test_memory_v2_leaves_the_drivers_reserve_out(nvml: NvmlStub) -> None:
@@ -120,7 +109,7 @@ def test_memory_v2_leaves_the_drivers_reserve_out(nvml: NvmlStub) -> None:
         f"gpu GPU-stub-a {24 * GIB} {512 * MIB} 0",
     ]
     nvml.write()
-    said = answer_of_child(nvml, READ)
+    said = answer_of(nvml, READ)
     assert said["gpus"] == [
         ["GPU-stub-b", 0, "NVIDIA Stub", 8 * GIB - 256 * MIB],
         ["GPU-stub-a", 1, "NVIDIA Stub", 24 * GIB - 512 * MIB],
@@ -132,7 +121,7 @@ def test_memory_v2_leaves_the_drivers_reserve_out(nvml: NvmlStub) -> None:
 def test_a_driver_without_memory_v2_counts_its_reserve_as_used(nvml: NvmlStub, code: int) -> None:
     nvml.gpu(GIB)
     nvml.write(f"error memory_v2 {code}")
-    said = answer_of_child(nvml, READ)
+    said = answer_of(nvml, READ)
     assert (said["used"], said["total"]) == (GIB + 256 * MIB, 8 * GIB)
 
 
@@ -145,7 +134,7 @@ def test_process_lists_come_with_na_as_unknown_and_both_kinds_counted_once(nvml:
         "process 0 compute 4194301 na",
         "process 0 graphics 4194302 7",
     )
-    mine, unknown, other = answer_of_child(nvml, READ)["processes"]
+    mine, unknown, other = answer_of(nvml, READ)["processes"]
     assert (mine[0], mine[2]) == (me, 2 * GIB)
     assert mine[1] > 0, "seen from here: with its start time"
     assert unknown == [4194301, 0, None], "all ones is N/A, not 16 EiB"
@@ -155,7 +144,7 @@ def test_process_lists_come_with_na_as_unknown_and_both_kinds_counted_once(nvml:
 def test_a_list_that_is_refused_leaves_the_total_as_truth(nvml: NvmlStub) -> None:
     nvml.gpu(GIB)
     nvml.write("error compute 3")
-    said = answer_of_child(nvml, READ)
+    said = answer_of(nvml, READ)
     assert (said["used"], said["processes"]) == (GIB, None)
 
 
@@ -178,7 +167,7 @@ def test_what_cannot_be_served_is_a_typed_error(
 ) -> None:
     nvml.gpu(0, more=more)
     nvml.write(*lines)
-    name, message, hint = answer_of_child(nvml, REFUSED)
+    name, message, hint = answer_of(nvml, REFUSED)
     assert (name, words in message) == (error, True), message
     assert hint
 
@@ -186,14 +175,14 @@ def test_what_cannot_be_served_is_a_typed_error(
 def test_no_gpu_at_all(nvml: NvmlStub) -> None:
     nvml.gpus = []
     nvml.write()
-    assert answer_of_child(nvml, REFUSED)[0] == "NoGpu"
+    assert answer_of(nvml, REFUSED)[0] == "NoGpu"
 
 
 def test_a_gpu_that_was_lost_is_read_again_after_the_driver_came_back(nvml: NvmlStub) -> None:
     """Every GPU failed, so everything is opened anew; a driver that is away meanwhile is one more
     failed reading."""
     gpu = f"gpu GPU-stub-0 {8 * GIB} 0"
-    said = answer_of_child(
+    said = answer_of(
         nvml,
         LOST,
         f"{gpu} 1\n{gpu} 2;error memory 15\n{gpu} 3;error init 9\ngpu GPU-other {GIB} 0 "
@@ -219,13 +208,13 @@ def test_instances_stand_in_the_place_of_their_gpu(nvml: NvmlStub) -> None:
         "process 1 compute 4194303 3",
     ]
     nvml.write(*where)
-    assert answer_of_child(nvml, ALL) == [
+    assert answer_of(nvml, ALL) == [
         [0, "MIG-stub-1", name, total, GIB, [[4194301, 5]]],
         [1, "MIG-stub-2", name, total, 2 * GIB, [[4194302, 7]]],
         [2, "GPU-stub-b", "NVIDIA Stub", 24 * GIB, 3, [[4194303, 3]]],
     ]
     nvml.write(*where, "process 0 compute 4194304 9")
-    assert [gpu[-1] for gpu in answer_of_child(nvml, ALL)] == [None, None, [[4194303, 3]]]
+    assert [gpu[-1] for gpu in answer_of(nvml, ALL)] == [None, None, [[4194303, 3]]]
 
 
 def test_an_instance_that_was_made_anew_is_unknown(nvml: NvmlStub) -> None:
@@ -234,7 +223,7 @@ def test_an_instance_that_was_made_anew_is_unknown(nvml: NvmlStub) -> None:
     former, other = (f"{gpu};instance 0 0 1 MIG-{name} {GIB} 0" for name in ("a", "b"))
     nvml.gpus = [*f"{former} 1".split(";")]
     nvml.write()
-    said = answer_of_child(nvml, LOST, f"{former} 2\n{other} 3\n{other} 4\n{former} 5\n")
+    said = answer_of(nvml, LOST, f"{former} 2\n{other} 3\n{other} 4\n{former} 5\n")
     assert (said[0], said[3]) == (2, 5)
     assert said[1] == "MIG-a is gone, MIG-b is in its place"
     assert "no longer lists MIG-a" in said[2]
@@ -245,15 +234,15 @@ def test_sensors_are_those_of_the_board(nvml: NvmlStub) -> None:
     nvml.gpus += [f"gpu GPU-stub-1 {GIB} 0 0", f"gpu GPU-stub-2 {GIB} 0 0 mig"]
     nvml.write(f"instance 2 0 1 MIG-1 {GIB} 0 0", "sensors 0 87 64 215400", "sensors 2 5 50 60000")
     unknown = [None, None, None]
-    assert answer_of_child(nvml, SENSORS) == [[0.87, 64.0, 215.4], unknown, unknown]
+    assert answer_of(nvml, SENSORS) == [[0.87, 64.0, 215.4], unknown, unknown]
     nvml.write("sensors 0 87 64 215400", "error sensors 15")
-    assert answer_of_child(nvml, SENSORS) == [unknown, unknown]
+    assert answer_of(nvml, SENSORS) == [unknown, unknown]
 
 
 def test_programs_take_instances_for_gpus(nvml: NvmlStub) -> None:
     nvml.instances(GIB, 2 * GIB)
     nvml.write()
-    of_all, of_named, second, counted = answer_of_child(nvml, PROGRAMS)
+    of_all, of_named, second, counted = answer_of(nvml, PROGRAMS)
     assert of_all == {"MIG-stub-1": 4 * GIB, "MIG-stub-2": 4 * GIB}
     assert of_named == {"MIG-stub-2": 4 * GIB}
     assert second == ["MIG-stub-2", 2 * GIB + 64 * MIB]
@@ -265,7 +254,7 @@ def test_a_program_shows_what_it_holds_itself(nvml: NvmlStub) -> None:
     pytest.importorskip("prometheus_client", reason="the extra `telemetry`")
     from tests.support import promql
 
-    idle, rendering = (promql.scrape(page) for page in answer_of_child(nvml, OWN))
+    idle, rendering = (promql.scrape(page) for page in answer_of(nvml, OWN))
     (drawn,) = (
         expression
         for text, expression in promql.panels("runner.json").items()
