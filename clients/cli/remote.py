@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from vram_arbiter.clients.cli import text
+from vram_arbiter.clients.cli import authorize, text
 from vram_arbiter.clients.cli.arguments import add_json, count
 from vram_arbiter.clients.cli.replies import NO, OK, answer
 from vram_arbiter.clients.client import AsyncClient
@@ -28,6 +28,8 @@ DESCRIPTIONS = {
     "OpenSSH. The server's arbiter takes the robot as a guest, which marks uses and holds no lease."
 }
 ACTIONS: Final = {
+    "authorize": "On the server: let a robot's key in, for the arbiter, the sidecars and the doors "
+    "that are named. Shows what the robot may then do, and what not.",
     "up": "Keep the tunnel to a server, until it is ended. Ends at once, with a reason, if the "
     "server refuses; after a loss it connects again.",
     "status": "Show each tunnel of this user, and whether the server's arbiter answers.",
@@ -37,7 +39,11 @@ STATUS_S: Final = 3.0  # to be answered through a tunnel
 
 def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     commands = parser.add_subparsers(metavar="ACTION", required=True)
-    for name, add in (("up", _add_up), ("status", _add_status)):
+    for name, add in (
+        ("authorize", authorize.add),
+        ("up", _add_up),
+        ("status", _add_status),
+    ):
         add(commands.add_parser(name, help=ACTIONS[name], description=ACTIONS[name]))
 
 

@@ -1,2 +1,1 @@
-"""A robot and a GPU server over OpenSSH, without a protocol of our own: the robot's tunnel, and the
-server's restricted keys."""
+"""A robot and its GPU server, over OpenSSH: nothing of the product listens on a network."""

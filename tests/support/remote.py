@@ -1,7 +1,6 @@
-"""A GPU server and a robot on one machine: the server's arbiter and a real sshd, the robot's
-`vramctl remote` in a folder of its own.
+"""A robot beside a GPU server on one machine: `vramctl remote` in a folder of the robot's own.
 
-The robot is the guest `arm1`; sockets of the server are in its arbiter's runtime folder.
+Sockets of the server are in its arbiter's runtime folder.
 """
 
 import json
@@ -13,39 +12,37 @@ import tempfile
 from pathlib import Path
 from typing import Any, Self
 
-from tests.support.process import ArbiterProcess, vramctl
-from tests.support.sshd import Sshd
-
-GROUP, GUESTS = "users", "games"
-"""Groups that each machine has, for the sockets and for the guests."""
-USER = "arm1"
+from tests.support.guests import USER, Server
+from tests.support.process import Make, vramctl
 
 
 class Remote:
-    """`with Remote(folder, arbiter) as remote:`; the arbiter is started with `ARGUMENTS`."""
+    """`with Remote(make_arbiter, folder) as remote:`; the robot may reach the arbiter and the
+    sidecar `grab`."""
 
-    ARGUMENTS = ("--group", GROUP, "--guests-group", GUESTS)
-
-    def __init__(self, folder: Path, arbiter: ArbiterProcess, **options: Any) -> None:
-        self.arbiter = arbiter
-        self.sshd = Sshd(folder / "sshd", [USER], {GROUP: [USER], GUESTS: [USER]}, **options)
+    def __init__(self, make_arbiter: Make, folder: Path) -> None:
+        self._server = Server(make_arbiter, folder / "sshd", (USER,))
+        self.arbiter, self.sshd = self._server.arbiter, self._server.sshd
         self.robot = Path(tempfile.mkdtemp(prefix="vr"))
-        self._network = bool(options.get("network"))
         self.known_hosts = self.robot / "known_hosts"
         self._keepers: list[subprocess.Popen[str]] = []
 
     def __enter__(self) -> Self:
         self.sshd.__enter__()
         self.known_hosts.write_text(self.sshd.host_key_line + "\n")
-        os.chmod(self.arbiter.runtime, 0o711)  # the folder of the units is open to its group
+        self.authorize()
         return self
 
     def __exit__(self, *_: object) -> None:
         for keeper in self._keepers:
-            keeper.kill()
+            keeper.terminate()
             keeper.communicate()
         self.sshd.__exit__()
         shutil.rmtree(self.robot)
+
+    def authorize(self, *doors: int) -> None:
+        """Let the robot's key in, also to ports of doors."""
+        self._server.authorize(USER, "grab", doors=doors)
 
     @property
     def host(self) -> str:
@@ -74,10 +71,7 @@ class Remote:
         command += ["--server-runtime", str(self.arbiter.runtime)]
         command += ["--known-hosts", str(self.known_hosts)]
         command += ["--identity", str(self.sshd.key(USER))]
-        inside = self.sshd.inside() if self._network else []
-        started = subprocess.Popen(
-            [*inside, *command], env=self.environ, stderr=subprocess.PIPE, text=True
-        )
+        started = subprocess.Popen(command, env=self.environ, stderr=subprocess.PIPE, text=True)
         self._keepers.append(started)
         return started
 

@@ -11,5 +11,5 @@ from tests.support.remote import Remote
 
 @pytest.fixture
 def remote(make_arbiter: Make, tmp_path: Path) -> Iterator[Remote]:
-    with Remote(tmp_path, make_arbiter(arguments=Remote.ARGUMENTS).start()) as made:
+    with Remote(make_arbiter, tmp_path) as made:
         yield made

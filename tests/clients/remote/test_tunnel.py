@@ -8,9 +8,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.support.guests import USER
 from tests.support.processes import children
-from tests.support.remote import USER, Remote, wait_for_line
-from tests.support.sshd import RESTRICTED
+from tests.support.remote import Remote, wait_for_line
 from tests.support.waiting import PATIENCE_S, until
 from vram_arbiter.clients.sync import Client, Lease
 from vram_arbiter.schemas.errors import RemoteMayNotHold
@@ -96,11 +96,10 @@ def test_a_refusal_ends_the_keeper_with_its_reason(remote: Remote) -> None:
     assert "ssh-keyscan -p" in refused(host=f"{USER}@localhost:{remote.sshd.port}")
     assert "grab is not served there" in refused("grab")
 
-    line = f"restrict {remote.sshd.public_key(USER)}"
-    remote.sshd.authorized(USER).write_text(line + "\n")
+    remote.sshd.authorized(USER).write_text(f"restrict {remote.sshd.public_key(USER)}\n")
     assert "may its key forward" in refused()
     assert any("refused streamlocal" in said for said in remote.sshd.log)
-    remote.sshd.authorized(USER).write_text(line.replace("restrict", RESTRICTED) + "\n")
+    remote.authorize()
 
     name = remote.sshd.host_key_line.split()[0]
     remote.known_hosts.write_text(f"{name} {remote.sshd.public_key(USER)}\n")

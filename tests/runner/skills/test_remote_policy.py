@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from tests.runner.skills.policy_bench import MANIFEST, Bench, Sidecar
+from tests.support.guests import USER
 from tests.support.process import Make
-from tests.support.remote import USER, Remote
+from tests.support.remote import Remote
 from tests.support.waiting import eventually
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
@@ -65,7 +66,7 @@ async def robot(
     for name in ("HUNG_MIN_S", "HUNG_FIRST_MIN_S", "HUNG_WAITING_MIN_S"):
         monkeypatch.setattr(sidecar_policy, name, HUNG_S)
     sidecar = Leased()
-    with Remote(tmp_path, make_arbiter(arguments=Remote.ARGUMENTS).start()) as remote:
+    with Remote(make_arbiter, tmp_path) as remote:
         async with (
             AsyncClient("grab", endpoint=remote.arbiter.endpoint) as server,
             server.lease(vram="1GiB", model="pi0", unload=lambda: None) as sidecar.lease,
