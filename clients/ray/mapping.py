@@ -1,13 +1,256 @@
-"""Numbered work over actors."""
+"""Numbered calls over actors of Ray: each seed has a result, which counts once, or a named failure.
 
+A call is sent once; after a death or its deadline its seed goes to another actor. Ray restarts the
+dead (`max_restarts=-1`). It gives no error of a process that stands still, so that each call has a
+deadline, and the actor is killed at its end. Before each seed an actor is asked for its node: one
+that is being restarted is given none.
+"""
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
+
+from vram_arbiter.clients.ray.residency import Refused
+from vram_arbiter.clients.results import commit, committed
+from vram_arbiter.schemas.errors import TransientError
+
+ATTEMPTS_MAX: Final = 3
+"""A seed whose actor dies so often, or is late, is the cause of it."""
+AWAY_MAX_S: Final = 120.0
+"""How long an actor may be refused, or not answer: a node's death is noticed within 30 s, and
+a busy machine starts an actor within a minute."""
+PAUSE_S: Final = 0.5
+"""Before an actor that failed is asked again."""
+NAMED_MAX: Final = 10
+"""Seeds that the error's text names; its details name all."""
+TOLD_MAX_CHARS: Final = 200
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What a seed's call returned, and the Ray node that it ran on."""
+    """What the call of a seed returned, and the Ray node that it ran on."""
 
     seed: int
     node: str
     value: Any
+
+
+class SeedsFailed(TransientError):
+    """Seeds have no result, when all others have one: `details.failed` says why, by seed."""
+
+
+class Seeds:
+    """Seeds that have no result yet. Pure."""
+
+    def __init__(self, seeds: Iterable[int], done: Iterable[int]) -> None:
+        left_out = set(done)
+        self.failed: dict[int, str] = {}
+        self._left = deque(seed for seed in dict.fromkeys(seeds) if seed not in left_out)
+        self._attempts = Counter[int]()
+
+    def __bool__(self) -> bool:
+        return bool(self._left)
+
+    def take(self) -> int:
+        return self._left.popleft()
+
+    def give_back(self, seed: int) -> None:
+        """Queue a seed whose call did not begin."""
+        self._left.appendleft(seed)
+
+    def lost(self, seed: int, why: str) -> None:
+        """Queue a seed whose actor died or was late, at the end, until it has failed too often."""
+        self._attempts[seed] += 1
+        if self._attempts[seed] < ATTEMPTS_MAX:
+            self._left.append(seed)
+        else:
+            self.failed[seed] = f"{why} ({ATTEMPTS_MAX} times)"
+
+    def strand(self, why: str) -> None:
+        """Fail all that are left."""
+        self.failed |= dict.fromkeys(self._left, why)
+        self._left.clear()
+
+    def check(self) -> None:
+        """Raise SeedsFailed for those that failed."""
+        if self.failed:
+            told = [f"{seed}: {why}" for seed, why in sorted(self.failed.items())]
+            raise SeedsFailed(
+                f"{len(told)} seeds have no result: {'; '.join(told[:NAMED_MAX])}",
+                hint="call it again: seeds with a result are left out",
+                details={"failed": {str(seed): why for seed, why in self.failed.items()}},
+            )
+
+
+@dataclass(slots=True, eq=False)
+class _Worker:
+    """One actor and what it was sent: a seed, or (`seed` None) the question for its node."""
+
+    actor: Any
+    node: str = ""
+    seed: int | None = None
+    sent: Any = None
+    due_at: float = 0.0
+    """When the call is late; without a call: when the next one may be sent."""
+    away_since: float | None = None
+    """When it failed, or was refused, with no seed ended since."""
+
+
+def map_results(
+    actors: Sequence[Any],
+    method: str,
+    seeds: Iterable[int],
+    out: Path,
+    deadline_s: float,
+    on_result: Callable[[Result], object] | None = None,
+) -> Iterator[Result]:
+    """Yield the results of `actor.method(seed)`, as they come, each committed to `out` before.
+
+    Seeds with a result in `out` are left out: the same call again goes on. An actor has one call
+    at a time; one that is listed twice has two.
+
+    Raises: SeedsFailed at the end, if seeds have no result: what the method raised, or what befell
+        its actors.
+    """
+    return _Mapping(actors, method, Seeds(seeds, committed(out)), out, deadline_s).run(on_result)
+
+
+class _Mapping:
+    def __init__(
+        self, actors: Sequence[Any], method: str, seeds: Seeds, out: Path, deadline_s: float
+    ) -> None:
+        self._workers = [_Worker(actor) for actor in actors]
+        self._method = method
+        self._seeds = seeds
+        self._out = out
+        self._deadline_s = deadline_s
+        self._away_max_s = max(AWAY_MAX_S, deadline_s)
+        self._last_seen = "none was given"
+
+    def run(self, on_result: Callable[[Result], object] | None) -> Iterator[Result]:
+        while self._seeds or any(worker.seed is not None for worker in self._workers):
+            if not self._workers:
+                self._seeds.strand(f"no actor is left: {self._last_seen}")
+                break
+            for worker in self._workers:
+                if worker.sent is None and self._seeds and time.monotonic() >= worker.due_at:
+                    self._send(worker, "__ray_call__", _node, self._away_max_s)
+            for worker, answered in self._ended():
+                if not answered:
+                    self._late(worker)
+                elif (result := self._answer(worker)) is not None:
+                    if on_result is not None:
+                        on_result(result)
+                    yield result
+        self._seeds.check()
+
+    # -- steps
+    def _send(self, worker: _Worker, method: str, argument: object, within_s: float) -> None:
+        worker.sent = getattr(worker.actor, method).options(max_task_retries=0).remote(argument)
+        worker.due_at = time.monotonic() + within_s
+
+    def _ended(self) -> list[tuple[_Worker, bool]]:
+        """Wait for an answer, a deadline or the end of a pause; return whose call has ended, and
+        whether by an answer."""
+        import ray
+
+        asked = [worker for worker in self._workers if worker.sent is not None]
+        wakes = [worker.due_at for worker in self._workers if worker.sent or self._seeds]
+        wait_s = max(0.0, min(wakes) - time.monotonic())
+        if not asked:
+            time.sleep(wait_s)
+            return []
+        answers, _ = ray.wait([worker.sent for worker in asked], timeout=wait_s)
+        now = time.monotonic()
+        return [
+            (worker, worker.sent in answers)
+            for worker in asked
+            if worker.sent in answers or worker.due_at <= now
+        ]
+
+    def _answer(self, worker: _Worker) -> Result | None:
+        from ray import exceptions, get
+
+        seed, sent, worker.seed, worker.sent = worker.seed, worker.sent, None, None
+        try:
+            value = get(sent)
+        except exceptions.RayTaskError as error:
+            self._raised(worker, seed, error)
+        except exceptions.RayError as error:
+            why = _told(error)
+            if seed is not None:
+                self._seeds.lost(seed, why)
+                self._rest(worker, why)
+            elif isinstance(error, exceptions.ActorDiedError):
+                self._drop(worker, why)
+            else:
+                self._rest(worker, why)
+        else:
+            if seed is not None:
+                worker.away_since = None
+                return self._committed(Result(seed, worker.node, value))
+            worker.node = value
+            if self._seeds:
+                worker.seed = self._seeds.take()
+                self._send(worker, self._method, worker.seed, self._deadline_s)
+        return None
+
+    def _raised(self, worker: _Worker, seed: int | None, error: Any) -> None:
+        """The call itself failed: what a body raises is not tried again."""
+        why = _told(error.cause)
+        if seed is None:
+            self._drop(worker, why)
+        elif isinstance(error.cause, Refused):
+            self._seeds.give_back(seed)
+            self._rest(worker, why)
+        else:
+            worker.away_since = None
+            self._seeds.failed[seed] = why
+
+    def _committed(self, result: Result) -> Result | None:
+        """None: it has another result already, or one that JSON cannot say."""
+        try:
+            return result if commit(self._out, result.seed, result.value) else None
+        except (TypeError, ValueError) as error:
+            self._seeds.failed[result.seed] = f"not a JSON value: {error}"
+            return None
+
+    def _late(self, worker: _Worker) -> None:
+        """Kill an actor without an answer; Ray restarts it."""
+        import ray
+
+        why, seed = "no answer before the deadline", worker.seed
+        worker.seed = worker.sent = None
+        ray.kill(worker.actor, no_restart=seed is None)
+        if seed is None:
+            self._drop(worker, why)
+        else:
+            self._seeds.lost(seed, why)
+            self._rest(worker, why)
+
+    def _rest(self, worker: _Worker, why: str) -> None:
+        """Ask it again after a pause, until it was away for too long."""
+        now = time.monotonic()
+        worker.due_at = now + PAUSE_S
+        worker.away_since = worker.away_since or now
+        if now - worker.away_since > self._away_max_s:
+            self._drop(worker, why)
+
+    def _drop(self, worker: _Worker, why: str) -> None:
+        self._workers.remove(worker)
+        self._last_seen = why
+
+
+def _node(_: Any) -> str:
+    """Runs on the actor."""
+    import ray
+
+    return str(ray.get_runtime_context().get_node_id())
+
+
+def _told(error: BaseException) -> str:
+    """Kind and first line of an error."""
+    return f"{type(error).__name__}: {error}".splitlines()[0][:TOLD_MAX_CHARS]

@@ -12,6 +12,7 @@ import os
 import threading
 import weakref
 from collections.abc import AsyncIterator, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
@@ -86,7 +87,8 @@ class Residency:
         self._wait_s = wait_s
         self._client: Client | None = None
         self._lease: Lease | None = None
-        self._loading = threading.Lock()
+        self._entering = threading.Lock()
+        self._thread = ThreadPoolExecutor(1)  # of coroutines' calls
         self._interval: Interval | None = None
         self._counting = threading.Lock()  # of calls; held for a moment
 
@@ -110,15 +112,15 @@ class Residency:
     # -- steps
     async def _entered(self, label: str) -> Interval:
         """`_enter` in a thread. Where the caller is canceled, what it begins is ended."""
-        entering = asyncio.create_task(asyncio.to_thread(self._enter, label))
+        entering = self._thread.submit(self._enter, label)
         try:
-            return await asyncio.shield(entering)
+            return await asyncio.wrap_future(entering)
         except asyncio.CancelledError:
             entering.add_done_callback(self._abandon)
             raise
 
-    def _abandon(self, entered: asyncio.Task[Interval]) -> None:
-        if entered.exception() is None:
+    def _abandon(self, entered: Future[Interval]) -> None:
+        if not entered.cancelled() and entered.exception() is None:
             self._leave(entered.result())
 
     @contextlib.contextmanager
@@ -141,13 +143,16 @@ class Residency:
             return interval
 
     def _enter(self, label: str) -> Interval:
-        """Begin a use, which others may join. The lease may be revoked at any moment before."""
-        while True:
-            lease = self._loaded()
-            try:
-                return lease._portal.call(self._begin, lease, label)
-            except LEFT:
-                continue
+        """Begin a use, loaded, which others may join; they wait for it here. The lease may be
+        revoked at any moment before."""
+        with self._entering:
+            while (joined := self._join()) is None:
+                lease = self._loaded()
+                try:
+                    return lease._portal.call(self._begin, lease, label)
+                except LEFT:
+                    continue
+            return joined
 
     async def _begin(self, lease: Lease, label: str) -> Interval:
         """Runs on the client's loop."""
@@ -171,14 +176,12 @@ class Residency:
             interval.end()
 
     def _loaded(self) -> Lease:
-        """The lease, with the model loaded; one thread loads, others wait for it."""
-        with self._loading:
-            if self._lease is not None and (self._lease.revoking or self._lease.state == "gone"):
-                self._lease.wait_gone()  # and for its unload
-                self._lease = None
-            if self._lease is None:
-                self._lease = self._load()
-            return self._lease
+        if self._lease is not None and (self._lease.revoking or self._lease.state == "gone"):
+            self._lease.wait_gone()  # and for its unload
+            self._lease = None
+        if self._lease is None:
+            self._lease = self._load()
+        return self._lease
 
     def _load(self) -> Lease:
         owner = self._owner()
