@@ -175,6 +175,7 @@ class _Mapping:
         from ray import exceptions, get
 
         seed, sent, worker.seed, worker.sent = worker.seed, worker.sent, None, None
+        worker.due_at = 0.0
         try:
             value = get(sent)
         except exceptions.RayTaskError as error:
