@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -34,11 +35,11 @@ def said_by(daemon: ArbiterProcess, name: str, *arguments: str) -> str:
     return done.stdout
 
 
-def event_kinds(daemon: ArbiterProcess, consumer: str) -> list[str]:
-    """Kinds of the history events of a consumer, in order."""
+def event_kinds(daemon: ArbiterProcess, consumer: str | None = None) -> list[str]:
+    """Kinds of the history events of a consumer, or of all, in order."""
     with Client("test", endpoint=daemon.endpoint) as arbiter:
         events = arbiter.history().events
-    return [event["kind"] for event in events if event.get("consumer") == consumer]
+    return [event["kind"] for event in events if consumer in (None, event.get("consumer"))]
 
 
 def in_order(wanted: Sequence[str], said: Sequence[str]) -> bool:
@@ -124,3 +125,23 @@ def test_a_client_in_another_language(arbiter_daemon: ArbiterProcess) -> None:
     assert said[1:] == ["working", "released"]
     story = ["granted", "ready", "use_began", "use_ended", "released"]
     assert in_order(story, event_kinds(arbiter_daemon, "sorter"))
+
+
+@pytest.mark.nightly
+def test_a_fleet(arbiter_daemon: ArbiterProcess, short_folder: Path, tmp_path: Path) -> None:
+    """It starts a raylet, which takes a minute of a busy machine."""
+    program = [sys.executable, str(EXAMPLES / "fleet.py"), str(tmp_path / "out")]
+    quiet = {"RAY_TMPDIR": str(short_folder), "RAY_USAGE_STATS_ENABLED": "0"}
+    said = [
+        subprocess.run(
+            program, env=environ(arbiter_daemon) | quiet, capture_output=True, text=True,
+            timeout=LIMIT_S, check=True,
+        ).stdout.splitlines()
+        for _ in range(2)
+    ]  # fmt: skip
+    assert sorted(line.partition(",")[0] for line in said[0]) == [
+        f"episode {seed}: {seed % 3 > 0}" for seed in range(6)
+    ]
+    assert all("weights on GPU-fake-" in line for line in said[0])
+    assert said[1] == []
+    assert in_order(["granted", "ready", "use_began", "use_ended"], event_kinds(arbiter_daemon))

@@ -138,13 +138,19 @@ def test_a_load_that_fails_gives_the_lease_up(make: Make, client: Client) -> Non
 
 
 @pytest.mark.e2e
-def test_a_wait_that_ends_is_refused(make: Make, client: Client, spec: Spec) -> None:
-    model = make(wait_s=0.1)
-    with client.lease(spec("other", 5, evictable=False)) as pinned:
+def test_a_wait_that_ends_is_refused_to_all_that_waited(
+    make: Make, client: Client, spec: Spec, arbiter_daemon: ArbiterProcess
+) -> None:
+    """Each waited for a time limit of its own, one after the other."""
+    model = make(wait_s=1.0)
+    with client.lease(spec("other", 5, evictable=False)) as pinned, ThreadPoolExecutor(4) as pool:
         pinned.ready()
-        with pytest.raises(Refused, match="not granted here") as refused:
-            model.act(1)
-        assert refused.value.details["code"] == "wait_timeout"
+        waiting = [pool.submit(model.act, 1) for _ in range(4)]
+        for one in waiting:
+            with pytest.raises(Refused, match="not granted here") as refused:
+                one.result(PATIENCE_S)
+            assert refused.value.details["code"] == "wait_timeout"
+        assert len(Timeline(arbiter_daemon).events("denied")) == 1
     assert model.act(1) == 1
 
 
