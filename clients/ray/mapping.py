@@ -9,7 +9,7 @@ that is being restarted is given none.
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -113,41 +113,40 @@ def map_results(
     Raises: SeedsFailed at the end, if seeds have no result: what the method raised, or what befell
         its actors.
     """
-    seeds_left = Seeds(seeds, committed(out))
-    for result in _Mapping(actors, method, seeds_left, out, deadline_s).run():
+    left, workers = Seeds(seeds, committed(out)), [_Worker(actor) for actor in actors]
+    for result in _Mapping(workers, method, left, out, deadline_s).run():
         if on_result is not None:
             on_result(result)
         yield result
-    seeds_left.check()
+    left.check()
 
 
+@dataclass(slots=True)
 class _Mapping:
-    def __init__(
-        self, actors: Sequence[Any], method: str, seeds: Seeds, out: Path, deadline_s: float
-    ) -> None:
-        self._workers = [_Worker(actor) for actor in actors]
-        self._method = method
-        self._seeds = seeds
-        self._out = out
-        self._deadline_s = deadline_s
-        self._ended_at = time.monotonic()  # of the last seed that did not just go back
-        self._last_seen = "there is none"
+    workers: Sequence[_Worker]
+    method: str
+    seeds: Seeds
+    out: Path
+    deadline_s: float
+    ended_at: float = field(default_factory=time.monotonic)
+    """When a seed ended last, and did not just go back."""
+    last_seen: str = "there is none"
 
     def run(self) -> Iterator[Result]:
-        away_max_s = AWAY_MAX_S + self._deadline_s
-        while self._seeds or any(worker.seed is not None for worker in self._workers):
-            if not self._workers or time.monotonic() - self._ended_at > away_max_s:
-                self._seeds.strand(f"no actor answers: {self._last_seen}")
+        away_max_s = AWAY_MAX_S + self.deadline_s
+        while self.seeds or any(worker.seed is not None for worker in self.workers):
+            if not self.workers or time.monotonic() - self.ended_at > away_max_s:
+                self.seeds.strand(f"no actor answers: {self.last_seen}")
                 return
-            for worker in self._workers:
-                if worker.sent is None and self._seeds and time.monotonic() >= worker.due_at:
+            for worker in self.workers:
+                if worker.sent is None and self.seeds and time.monotonic() >= worker.due_at:
                     self._send(worker, "__ray_call__", _node, away_max_s)
             for worker, answered in self._ended():
                 if not answered:
                     self._late(worker)
                 elif (result := self._answer(worker)) is not None:
                     yield result
-                    self._ended_at = time.monotonic()  # the caller may have taken its time
+                    self.ended_at = time.monotonic()  # the caller may have taken its time
 
     # -- steps
     def _send(self, worker: _Worker, method: str, argument: object, within_s: float) -> None:
@@ -159,8 +158,8 @@ class _Mapping:
         whether by an answer."""
         import ray
 
-        asked = [worker for worker in self._workers if worker.sent is not None]
-        wakes = [worker.due_at for worker in self._workers if worker.sent or self._seeds]
+        asked = [worker for worker in self.workers if worker.sent is not None]
+        wakes = [worker.due_at for worker in self.workers if worker.sent or self.seeds]
         wait_s = max(0.0, min(wakes) - time.monotonic())
         if not asked:
             time.sleep(wait_s)
@@ -192,9 +191,9 @@ class _Mapping:
             if seed is not None:
                 return self._committed(Result(seed, worker.node, value))
             worker.node = value
-            if self._seeds:
-                worker.seed = self._seeds.take()
-                self._send(worker, self._method, worker.seed, self._deadline_s)
+            if self.seeds:
+                worker.seed = self.seeds.take()
+                self._send(worker, self.method, worker.seed, self.deadline_s)
         return None
 
     def _late(self, worker: _Worker) -> None:
@@ -207,29 +206,29 @@ class _Mapping:
 
     def _committed(self, result: Result) -> Result | None:
         """None: it has another result already, or one that JSON cannot say."""
-        self._ended_at = time.monotonic()
+        self.ended_at = time.monotonic()
         try:
-            return result if commit(self._out, result.seed, result.value) else None
+            return result if commit(self.out, result.seed, result.value) else None
         except (TypeError, ValueError) as error:
             self._fail(result.seed, error)
             return None
 
     def _fail(self, seed: int, error: BaseException) -> None:
-        self._ended_at = time.monotonic()
-        self._seeds.failed[seed] = _told(error)
+        self.ended_at = time.monotonic()
+        self.seeds.failed[seed] = _told(error)
 
     def _lost(self, worker: _Worker, seed: int | None, error: BaseException) -> None:
         if seed is not None:
-            self._ended_at = time.monotonic()
-            self._seeds.lost(seed, _told(error))
+            self.ended_at = time.monotonic()
+            self.seeds.lost(seed, _told(error))
         self._rest(worker, None, error)
 
     def _rest(self, worker: _Worker, seed: int | None, error: BaseException) -> None:
         """Let an actor pause; its seed, if it has not begun, goes back."""
         worker.due_at = time.monotonic() + PAUSE_S
-        self._last_seen = _told(error)
+        self.last_seen = _told(error)
         if seed is not None:
-            self._seeds.give_back(seed)
+            self.seeds.give_back(seed)
 
 
 def _node(_: Any) -> str:

@@ -61,22 +61,18 @@ class Owner(Protocol):
 
 @dataclass(slots=True, eq=False)
 class Interval:
-    """A use that several calls share; `open` while more may join."""
+    """A use that several calls share; `open` while more may join, which counts as a call."""
 
     use: AbstractAsyncContextManager[AsyncUse]
-    loop: asyncio.AbstractEventLoop
     begun: AsyncUse
-    calls: int = 1
+    loop: asyncio.AbstractEventLoop
+    calls: int = 2
     open: bool = True
-    ended: asyncio.Task[bool | None] | None = None
 
     def end(self) -> None:
         """End the use. Any thread may call."""
-        self.loop.call_soon_threadsafe(self._end)
-
-    def _end(self) -> None:
         leaving: Any = self.use.__aexit__(None, None, None)
-        self.ended = self.loop.create_task(leaving)
+        self.loop.call_soon_threadsafe(self.loop.create_task, leaving)
 
 
 class Residency:
@@ -163,21 +159,18 @@ class Residency:
     async def _begin(self, lease: Lease, label: str) -> Interval:
         """Runs on the client's loop."""
         use, loop = lease._twin.use(label), asyncio.get_running_loop()
-        self._interval = interval = Interval(use, loop, await use.__aenter__())
+        self._interval = interval = Interval(use, await use.__aenter__(), loop)
         loop.call_later(SHARE_S, self._close, interval)
         return interval
 
     def _close(self, interval: Interval) -> None:
-        with self._counting:
-            interval.open = False
-            over = not interval.calls
-        if over:
-            interval.end()
+        interval.open = False
+        self._leave(interval)
 
     def _leave(self, interval: Interval) -> None:
         with self._counting:
             interval.calls -= 1
-            over = not interval.open and not interval.calls
+            over = not interval.calls
         if over:
             interval.end()
 

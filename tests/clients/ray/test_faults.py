@@ -8,6 +8,7 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,13 @@ import pytest
 from tests.support.boxes import MARKER, Box, Boxes
 from tests.support.episodes import Player, freed_inside, noted
 from tests.support.fakegpu_check import check_log
+from tests.support.processes import alive
+from tests.support.waiting import until
+from vram_arbiter.clients.ray import leased
 from vram_arbiter.clients.ray.mapping import Result, map_results
 from vram_arbiter.clients.results import committed
+from vram_arbiter.clients.sync import Client
+from vram_arbiter.testing.timeline import Timeline
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(600)]
 
@@ -132,12 +138,48 @@ def test_a_daemon_is_restarted_under_actors(
 def test_a_process_stands_still(boxes: Boxes, player: Make, notes: Path, tmp_path: Path) -> None:
     """Ray gives no error of it: its deadline ends it."""
     actors = [player(box) for box in boxes.nodes]
-    pids = [pid_of(actor) for actor in actors]
-    out = tmp_path / "out"
-    stop = {12: lambda: os.kill(pids[1], signal.SIGSTOP)}
-    check_each_once(play(actors, out, stop, deadline_s=5.0), out)
+    pid, out = pid_of(actors[1]), tmp_path / "out"
+    with ThreadPoolExecutor(1) as pool:
+        frozen = pool.submit(until, lambda: frozen_inside(notes, pid))
+        check_each_once(play(actors, out, {}, deadline_s=5.0), out)
+        assert frozen.result()
+    until(lambda: not alive(pid))
     check_gpus(boxes, notes)
-    assert pid_of(actors[1]) != pids[1]
+    assert pid_of(actors[1]) != pid
+
+
+def frozen_inside(notes: Path, pid: int) -> bool:
+    """Stop a process; it goes on if that was not inside an episode."""
+
+    def inside() -> bool:
+        return [one["pid"] for what in ("begun", "ended") for one in noted(notes, what)].count(
+            pid
+        ) % 2 == 1
+
+    if not inside():
+        return False
+    os.kill(pid, signal.SIGSTOP)
+    if not inside():
+        os.kill(pid, signal.SIGCONT)
+        return False
+    return True
+
+
+def test_a_leased_task_ends_with_its_lease(boxes: Boxes) -> None:
+    import ray
+
+    def job() -> int:
+        return os.getpid()
+
+    task: Any = leased(vram="5GiB", model="job")(ray.remote(max_calls=1)(job))
+    pids = [ray.get(task.options(resources={MARKER: 0.001}).remote()) for _ in range(2)]
+    assert pids[0] != pids[1]
+    for box in boxes.nodes:
+        with Client("test", endpoint=box.daemon.endpoint) as arbiter:
+            until(lambda arbiter=arbiter: not arbiter.status().leases)
+    granted = [one for box in boxes.nodes for one in Timeline(box.daemon).events("granted")]
+    consumers = {one["consumer"] for one in granted}
+    assert {f"job-{pid}" for pid in pids} <= consumers
 
 
 def test_a_node_and_its_arbiter_are_killed(
