@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from tests.bench.harness import Suite, elapsed_us, in_turns, p50, pause, summed
-from tests.support.boxes import MARKER, Box, Boxes
+from tests.support.boxes import Box, Boxes
 from tests.support.episodes import Bare, BareAsync, Caller, CallerAsync, SmallPlayer
 from tests.support.waiting import until
-from vram_arbiter.clients.ray.mapping import Result, map_results
+from vram_arbiter.clients.ray import Fleet, Result
+from vram_arbiter.clients.ray.mapping import map_results
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.testing.gpu import FakeGpu
 
@@ -34,26 +35,23 @@ REPLACED_S, BACK_S = 30.0, 0.3
 
 
 @contextmanager
-def fleet(nodes: int) -> Iterator[Boxes]:
+def boxes_of(nodes: int) -> Iterator[tuple[Boxes, Fleet]]:
     with (
         tempfile.TemporaryDirectory(prefix="b") as folder,
         Boxes(Path(folder), nodes=nodes) as boxes,
     ):
         boxes.connect()
-        yield boxes
+        with Fleet() as fleet:
+            yield boxes, fleet
 
 
-def start(cls: type, box: Box, *arguments: object) -> Any:
-    """An actor on a box, which moves if the box is gone; it is loaded if it is leased."""
+def started(fleet: Fleet, box: Box, cls: type, *arguments: object, per_node: int = 1) -> list[Any]:
+    """Actors of a box, loaded if they are leased."""
     import ray
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    where = NodeAffinitySchedulingStrategy(box.node_id, soft=True)
-    options = {"max_restarts": -1, "max_task_retries": -1, "resources": {MARKER: 0.001}}
-    made: Any = ray.remote(cls)
-    actor = made.options(num_cpus=0, scheduling_strategy=where, **options).remote(*arguments)
-    ray.get(actor.ping.remote())
-    return actor
+    actors = fleet.spread(cls, *arguments, per_node=per_node, nodes=[box.node_id])
+    ray.get([actor.ping.remote() for actor in actors])
+    return actors
 
 
 def calls(suite: Suite) -> None:
@@ -67,9 +65,11 @@ def calls(suite: Suite) -> None:
 
         return once
 
-    with fleet(1) as boxes:
+    with boxes_of(1) as (boxes, fleet):
+        (box,) = boxes.nodes
         for kind, (bare, leased, at_most_ms) in CALLS.items():
-            actors = {"bare": start(bare, boxes.nodes[0]), "leased": start(leased, boxes.nodes[0])}
+            (actor,), (leased_actor,) = started(fleet, box, bare), started(fleet, box, leased)
+            actors = {"bare": actor, "leased": leased_actor}
             for name, apart_s, rounds in (("", 0.0, 2000), (", 50 ms apart", APART_S, 200)):
                 timed = {one: call(actor, apart_s) for one, actor in actors.items()}
                 found = in_turns(suite.size(rounds, rounds // 10), timed)
@@ -82,9 +82,12 @@ def calls(suite: Suite) -> None:
 def scaling(suite: Suite) -> None:
     """The same sleeping episodes on 1, 2 and 4 boxes."""
     took: dict[int, float] = {}
-    with fleet(max(SCALING)) as boxes, tempfile.TemporaryDirectory(prefix="b") as folder:
+    with (
+        boxes_of(max(SCALING)) as (boxes, fleet),
+        tempfile.TemporaryDirectory(prefix="b") as folder,
+    ):
         players = [
-            [start(SmallPlayer, box, folder, EPISODE_S) for _ in range(PER_NODE)]
+            started(fleet, box, SmallPlayer, folder, EPISODE_S, per_node=PER_NODE)
             for box in boxes.nodes
         ]
         for nodes in (1, *SCALING):
@@ -117,8 +120,9 @@ def played(
 
 
 def node_death(suite: Suite) -> None:
-    with fleet(2) as boxes, tempfile.TemporaryDirectory(prefix="b") as folder:
-        actors = [start(SmallPlayer, box, folder, EPISODE_S) for box in boxes.nodes]
+    with boxes_of(2) as (boxes, fleet), tempfile.TemporaryDirectory(prefix="b") as folder:
+        spread = [started(fleet, box, SmallPlayer, folder, EPISODE_S) for box in boxes.nodes]
+        actors = [actor for (actor,) in spread]
         killed_at = 0.0
 
         def seen(count: int) -> None:
@@ -139,12 +143,12 @@ def bytes_back(suite: Suite) -> None:
     import ray
 
     samples = []
-    with fleet(1) as boxes, tempfile.TemporaryDirectory(prefix="b") as folder:
+    with boxes_of(1) as (boxes, fleet), tempfile.TemporaryDirectory(prefix="b") as folder:
         (box,) = boxes.nodes
         FakeGpu(box.gpu_folder).edit(release_lag_s=0.0)
         with Client("bench", endpoint=box.daemon.endpoint) as arbiter:
             for _ in range(suite.size(5, 2)):
-                actor = start(SmallPlayer, box, folder, 0.0)
+                (actor,) = started(fleet, box, SmallPlayer, folder, 0.0)
                 began = time.monotonic()
                 ray.kill(actor)
                 until(lambda: not arbiter.status().leases)

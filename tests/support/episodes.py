@@ -59,7 +59,7 @@ class Episodes(Bare):
         return {"seed": seed, "pid": os.getpid()}
 
 
-@leased(vram="5GiB", model="large", wait_s=60)
+@leased(vram="5GiB", model="episodes", wait_s=60)
 class Player(Episodes):
     """Two do not fit on a simulated GPU of 8 GiB."""
 
