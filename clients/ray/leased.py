@@ -16,12 +16,12 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import wraps
+from types import SimpleNamespace
 from typing import Any, Final, cast
 
 from vram_arbiter.clients._spec import Vram, lease_spec
 from vram_arbiter.clients.cuda import visible
 from vram_arbiter.clients.ray.residency import Residency
-from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.errors import BadRequest
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
@@ -181,14 +181,9 @@ def _leased_task(made: Any, spec: LeasedSpec) -> Any:
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        name = f"{spec.lease.consumer}-{os.getpid()}"
-        with Client(name) as arbiter:
-            lease = arbiter.acquire(spec.lease, spec.wait_s)
-            os.environ.update(visible(lease.gpu, os.environ))
-            try:
-                with lease.use():
-                    return function(*arguments, **named)
-            finally:
-                lease.release(exiting=True)
+        job: Any = SimpleNamespace(load=lambda: None, unload=lambda: None)
+        with Residency(job, spec.lease, spec.wait_s).call(""):
+            os.environ.update(visible(job.lease.gpu, os.environ))
+            return function(*arguments, **named)
 
     return ray.remote(**options)(call)
