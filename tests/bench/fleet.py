@@ -10,13 +10,17 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from tests.bench.harness import Suite, elapsed_us, in_turns, p50, pause, summed
+from tests.e2e.test_guests import policy_server, seconds_until_the_grant, uses
 from tests.support.boxes import Box, Boxes
 from tests.support.episodes import Bare, BareAsync, Caller, CallerAsync, SmallPlayer
+from tests.support.guests import server
+from tests.support.process import ArbiterProcess
+from tests.support.sshd import unavailable
 from tests.support.waiting import until
 from vram_arbiter.clients.ray import Fleet, Result
 from vram_arbiter.clients.ray.mapping import map_results
@@ -31,7 +35,8 @@ SEEDS, EPISODE_S, PER_NODE = 40, 0.5, 2
 SCALING = {2: 0.95, 4: 0.9}
 KILLED_AT = 12
 DEADLINE_S = 120.0
-REPLACED_S, BACK_S = 30.0, 0.3
+REPLACED_S, BACK_S, SILENT_S = 30.0, 0.3, 5.0
+SILENT_ROW = "network silent -> other model granted"
 
 
 @contextmanager
@@ -156,7 +161,37 @@ def bytes_back(suite: Suite) -> None:
     suite.figure("ray.kill -> bytes verified back, median", p50(samples), "s", at_most=BACK_S)
 
 
-SUBJECTS = {"calls": calls, "scaling": scaling, "node-death": node_death, "bytes-back": bytes_back}
+def silent_network(suite: Suite) -> None:
+    """From the last packet of a robot behind ssh to the grant of the model that waited for its use
+    to end."""
+    if why := unavailable():
+        suite.skipped(SILENT_ROW, why)
+        return
+    with ExitStack() as stack:
+
+        def make(*arguments: Any, **named: Any) -> ArbiterProcess:
+            daemon = ArbiterProcess(*arguments, **named)
+            stack.callback(daemon.close)
+            return daemon
+
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="b"))
+        there = stack.enter_context(server(make, Path(folder), network=True))
+        policy, lease = stack.enter_context(policy_server(there))
+        _, endpoint = stack.enter_context(there.tunnel())
+        robot = stack.enter_context(Client("arm1", endpoint=endpoint))
+        stack.enter_context(robot.use(lease.lease_id, lease.token, "goal"))
+        until(lambda: uses(policy, lease) == 1)
+        took_s = seconds_until_the_grant(there, policy, lease, there.sshd.silence)
+    suite.figure(SILENT_ROW, took_s, "s", at_most=SILENT_S)
+
+
+SUBJECTS = {
+    "calls": calls,
+    "scaling": scaling,
+    "node-death": node_death,
+    "bytes-back": bytes_back,
+    "silent-network": silent_network,
+}
 
 
 def main() -> int:
