@@ -115,13 +115,13 @@ def _leased_class[C: type[Any]](made: C, spec: LeasedSpec) -> C:
         setattr(made, name, _inside_a_use(made, method))
     begin: Any = made.__init__
 
-    @wraps(begin)
     def init(self: Any, *arguments: Any, **named: Any) -> None:
         _refuse_assigned()
         self._residency = Residency(self, spec.lease, spec.wait_s)
         begin(self, *arguments, **named)
 
-    made.__init__ = init
+    # Ray signs the innermost function, and object's is none
+    made.__init__ = wraps(begin)(init) if inspect.isfunction(begin) else init
     made.leased = spec
     return made
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import gc
+import inspect
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -216,6 +217,19 @@ def test_bytes_and_gpus_beside_a_lease_are_refused_by_name() -> None:
     for name in ("num_gpus", "GPU", "vram_bytes"):
         with pytest.raises(BadRequest, match=name):
             refuse_resources([name])
+
+
+def test_methods_are_functions_to_their_core() -> None:
+    """Ray puts a signature on the innermost one; it refused classes without `__init__`."""
+
+    class Bare:
+        def load(self) -> None: ...
+
+        def unload(self) -> None: ...
+
+    for made in (Bare, Model):
+        kept = type(made.__name__, (made,), {})
+        assert inspect.isfunction(inspect.unwrap(leased(vram="5GiB", model="m")(kept).__init__))
 
 
 def test_only_idempotent_methods_are_sent_again() -> None:
