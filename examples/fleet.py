@@ -1,9 +1,10 @@
 """Numbered episodes on a fleet: actors of Ray whose model is on a GPU by a lease of their box.
 
-Start the arbiter first: `vram-arbiter --gpu fake:8GiB` simulates a GPU. The fleet is this machine
-alone; `ray.init(address="auto")` connects to a cluster. The same command again plays only episodes
-without a result.
+Start the arbiter first: `vram-arbiter --gpu fake:8GiB` simulates a GPU. A box is a node of Ray with
+the resource `vram_arbiter`; here it is this machine, on loopback, because Ray runs the code of
+whoever reaches it. The same command again plays only episodes without a result.
 
+    ray start --head --node-ip-address=127.0.0.1 --resources='{"vram_arbiter": 1000}'
     python examples/fleet.py out/episodes
 """
 
@@ -30,8 +31,7 @@ class Policy:
         return {"success": seed % 3 > 0, "net": self.net}
 
 
-# a box is a node with this resource; loopback, because Ray runs the code of whoever reaches it
-ray.init(resources={"vram_arbiter": 1000}, _node_ip_address="127.0.0.1", include_dashboard=False)
+ray.init(address="auto")
 out = Path(sys.argv[1] if sys.argv[1:] else "out/episodes")
 with Fleet() as fleet:
     policies = fleet.spread(Policy)

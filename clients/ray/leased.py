@@ -16,12 +16,12 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import wraps
-from types import SimpleNamespace
 from typing import Any, Final, cast
 
 from vram_arbiter.clients._spec import Vram, lease_spec
 from vram_arbiter.clients.cuda import visible
 from vram_arbiter.clients.ray.residency import Residency
+from vram_arbiter.clients.sync import Lease
 from vram_arbiter.schemas.errors import BadRequest
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
@@ -166,6 +166,16 @@ def _refuse_assigned() -> None:
 
 
 # -- tasks
+class _Job:
+    """Owner of a task's lease; the task loads for itself."""
+
+    lease: Lease
+
+    def load(self) -> None: ...
+
+    def unload(self) -> None: ...
+
+
 def _leased_task(made: Any, spec: LeasedSpec) -> Any:
     options = getattr(made, "_default_options", {})
     if options.get("max_calls") != 1:
@@ -181,7 +191,7 @@ def _leased_task(made: Any, spec: LeasedSpec) -> Any:
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        job: Any = SimpleNamespace(load=lambda: None, unload=lambda: None)
+        job = _Job()
         with Residency(job, spec.lease, spec.wait_s).call(""):
             os.environ.update(visible(job.lease.gpu, os.environ))
             return function(*arguments, **named)

@@ -1,5 +1,6 @@
 """Each program of `examples/` against a real daemon with a simulated GPU."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.boxes import Boxes
 from tests.support.prepared import run
 from tests.support.process import ArbiterProcess, Finished
 from tests.support.running import running
@@ -128,21 +130,21 @@ def test_a_client_in_another_language(arbiter_daemon: ArbiterProcess) -> None:
 
 
 @pytest.mark.nightly
-def test_a_fleet(arbiter_daemon: ArbiterProcess, short_folder: Path, tmp_path: Path) -> None:
-    """It starts a raylet, which takes a minute of a busy machine."""
+def test_a_fleet(short_folder: Path, tmp_path: Path) -> None:
     program = [sys.executable, str(EXAMPLES / "fleet.py"), str(tmp_path / "out")]
-    quiet = {"RAY_TMPDIR": str(short_folder), "RAY_USAGE_STATS_ENABLED": "0"}
     said = []
-    for _ in range(2):
-        done = subprocess.run(
-            program, env=environ(arbiter_daemon) | quiet, capture_output=True, text=True,
-            timeout=LIMIT_S, check=False,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        said.append(done.stdout.splitlines())
+    with Boxes(short_folder, nodes=1) as boxes:
+        for _ in range(2):
+            done = subprocess.run(
+                program, env=os.environ | {"RAY_ADDRESS": boxes.address},
+                capture_output=True, text=True, timeout=LIMIT_S, check=False,
+            )  # fmt: skip
+            assert done.returncode == 0, done.stderr
+            said.append(done.stdout.splitlines())
+        told = event_kinds(boxes.nodes[0].daemon)
     assert sorted(line.partition(",")[0] for line in said[0]) == [
         f"episode {seed}: {seed % 3 > 0}" for seed in range(6)
     ]
     assert all("weights on GPU-fake-" in line for line in said[0])
     assert said[1] == []
-    assert in_order(["granted", "ready", "use_began", "use_ended"], event_kinds(arbiter_daemon))
+    assert in_order(["granted", "ready", "use_began", "use_ended"], told)

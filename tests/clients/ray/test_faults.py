@@ -70,7 +70,8 @@ def start(boxes: Boxes, notes: Path) -> Iterator[Start]:
 def pid_of(actor: Any) -> int:
     import ray
 
-    pid: int = ray.get(actor.__ray_call__.remote(lambda self: os.getpid()))
+    call = actor.__ray_call__.options(max_task_retries=-1)
+    pid: int = ray.get(call.remote(lambda self: os.getpid()))
     return pid
 
 
