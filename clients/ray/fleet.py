@@ -161,12 +161,12 @@ class Fleet:
         method: str,
         seeds: Iterable[int],
         *,
-        out: Path,
+        out: Path | str,
         deadline_s: float,
         on_result: Callable[[Result], object] | None = None,
     ) -> Iterator[Result]:
         """Yield `actor.method(seed)` of all seeds, each once: see `mapping.map_results`."""
-        return map_results(actors, method, seeds, out, deadline_s, on_result)
+        return map_results(actors, method, seeds, Path(out), deadline_s, on_result)
 
     # -- steps
     def _answers(self, timeout_s: float, method: str, *asked: str) -> Iterator[tuple[str, Any]]:
