@@ -4,6 +4,7 @@ by it. Ray runs and restarts actors; each box's arbiter decides what its GPU hol
 
 import contextlib
 import ipaddress
+import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -25,6 +26,7 @@ ANSWER_S: Final = 1.0
 """How long agents are waited for. Views of 1,000 boxes take half of it."""
 START_S: Final = 60.0
 """An agent or actor starts a Python that imports Ray: up to 10 s on a machine with other work."""
+CONNECT_S: Final = 3.0
 SLIVER: Final = 0.001
 """Of a node's marker, which any number of actors share."""
 
@@ -207,9 +209,12 @@ def connected(address: str) -> Iterator[Fleet]:
     need("a fleet", "ray", extra="ray")
     import ray
 
+    host, _, port = address.rpartition(":")
     try:
+        if host:  # else Ray looks on this machine; where nothing listens it would try for minutes
+            socket.create_connection((host, int(port)), CONNECT_S).close()
         ray.init(address=address, logging_level="ERROR", log_to_driver=False)
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         raise ArbiterUnreachable(
             f"no Ray cluster answers at {address}: {error}",
             hint="name one as HOST:PORT; where it has authentication, set RAY_AUTH_TOKEN too",
