@@ -52,7 +52,7 @@ SILENT: dict[str, Ends] = {
 def policy_server(there: Server) -> Iterator[tuple[Client, Lease]]:
     """The holder of 5 of 8 GiB, which may be evicted between uses at once."""
     with Client("policy", endpoint=there.endpoint) as policy:
-        fields = {"vram": "5GiB", "model": "pi0", "min_residency_s": 0.0}
+        fields: dict[str, Any] = {"vram": "5GiB", "model": "pi0", "min_residency_s": 0.0}
         lease = policy.acquire(unload=lambda: None, **fields)
         lease.ready()
         yield policy, lease

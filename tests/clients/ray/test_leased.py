@@ -1,0 +1,247 @@
+"""Leased classes as plain objects against a real daemon; Ray adds processes alone."""
+
+import asyncio
+import gc
+import inspect
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import pytest
+
+from tests.support.fakegpu_check import check_log
+from tests.support.leases import Spec
+from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S, play, until
+from vram_arbiter.clients.ray import Refused, idempotent, leased
+from vram_arbiter.clients.ray.leased import refuse_resources
+from vram_arbiter.clients.sync import Client
+from vram_arbiter.schemas.defaults import GIB
+from vram_arbiter.schemas.errors import BadRequest, LeaseRevoking
+from vram_arbiter.testing.gpu import FakeGpu
+from vram_arbiter.testing.timeline import Timeline
+
+
+class Model:
+    """Puts its bytes on the simulated GPU; `go` lets `wait` end."""
+
+    folder: Any
+    lease: Any
+    fails = False
+
+    def __init__(self) -> None:
+        self.begun, self.go = threading.Event(), threading.Event()
+        self.loads = self.unloads = 0
+
+    def load(self) -> None:
+        if self.fails:
+            raise RuntimeError("no weights")
+        self.loads += 1
+        self.warmed = self.act(self.loads)
+        FakeGpu(self.folder, "model").allocate("5GiB")
+
+    def unload(self) -> None:
+        self.unloads += 1
+        FakeGpu(self.folder, "model").free()
+
+    def act(self, x: int) -> int:
+        return x
+
+    def nested(self, x: int) -> int:
+        return self.act(x) + 1
+
+    def wait(self) -> str:
+        self.begun.set()
+        assert self.go.wait(PATIENCE_S)
+        return "held"
+
+    def refused_inside(self) -> None:
+        self.loads += 10
+        raise LeaseRevoking("of another lease")
+
+    async def later(self, x: int) -> int:
+        await asyncio.sleep(0)
+        return x
+
+
+Make = Callable[..., Any]
+
+
+@pytest.fixture
+def make(arbiter_daemon: ArbiterProcess, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
+    """`make(wait_s=…)`: an object of a leased class of 5 GiB of 8."""
+    monkeypatch.setenv("VRAM_ARBITER_ENDPOINT", arbiter_daemon.endpoint)
+
+    def make(**options: Any) -> Any:
+        class Policy(Model):
+            folder = arbiter_daemon.gpu_folder
+
+        return leased(vram="5GiB", model="pi0", **options)(Policy)()
+
+    yield make
+    gc.collect()
+    report = check_log((arbiter_daemon.gpu_folder / "log.jsonl").read_text())
+    assert (report.problems, report.oom_events, report.peak_bytes) == ([], 0, 5 * GIB)
+
+
+@pytest.mark.e2e
+def test_the_first_call_loads_and_calls_that_follow_share_uses(
+    make: Make, arbiter_daemon: ArbiterProcess
+) -> None:
+    model = make()
+    assert model.loads == 0
+    assert [model.act(x) for x in range(200)] == list(range(200))
+    assert (model.loads, model.warmed) == (1, 1)
+    assert model.lease.gpu.startswith("GPU-fake-")
+    assert 1 <= len(Timeline(arbiter_daemon).events("use_began")) < 200
+    until(lambda: model.lease.uses == 0)
+
+
+@pytest.mark.e2e
+def test_evicted_between_calls_and_never_inside(make: Make, client: Client, spec: Spec) -> None:
+    model = make()
+    with ThreadPoolExecutor(2) as pool:
+        inside = pool.submit(model.wait)
+        assert model.begun.wait(PATIENCE_S)
+        waiting = pool.submit(client.acquire, spec("other", 5))
+        until(lambda: model.lease.revoking)
+        assert model.unloads == 0
+        model.go.set()
+        assert inside.result(PATIENCE_S) == "held"
+        other = waiting.result(PATIENCE_S)
+    assert model.unloads == 1
+    again = threading.Thread(target=other.release)
+    again.start()
+    assert model.nested(1) == 2
+    again.join()
+    assert model.loads == 2
+
+
+@pytest.mark.e2e
+def test_a_body_is_never_run_again(make: Make) -> None:
+    """A refusal of another lease inside the body is the caller's."""
+    model = make()
+    with pytest.raises(LeaseRevoking, match="of another lease"):
+        model.refused_inside()
+    assert model.loads == 11
+
+
+@pytest.mark.e2e
+def test_a_load_that_fails_gives_the_lease_up(make: Make, client: Client) -> None:
+    model = make()
+    model.fails = True
+    with pytest.raises(RuntimeError, match="no weights"):
+        model.act(1)
+    until(lambda: client.status().leases == ())
+    model.fails = False
+    assert model.act(1) == 1
+
+
+@pytest.mark.e2e
+def test_a_wait_that_ends_is_refused_to_all_that_waited(
+    make: Make, client: Client, spec: Spec, arbiter_daemon: ArbiterProcess
+) -> None:
+    """Each waited for a time limit of its own, one after the other."""
+    model = make(wait_s=1.0)
+    with client.lease(spec("other", 5, evictable=False)) as pinned, ThreadPoolExecutor(4) as pool:
+        pinned.ready()
+        waiting = [pool.submit(model.act, 1) for _ in range(4)]
+        for one in waiting:
+            with pytest.raises(Refused, match="not granted here") as refused:
+                one.result(PATIENCE_S)
+            assert refused.value.details["code"] == "wait_timeout"
+        assert len(Timeline(arbiter_daemon).events("denied")) == 1
+    assert model.act(1) == 1
+
+
+@pytest.mark.e2e
+def test_the_end_of_the_object_gives_the_lease_back(make: Make, client: Client) -> None:
+    model = make()
+    model.act(1)
+    del model
+    gc.collect()
+    until(lambda: client.status().leases == ())
+
+
+@pytest.mark.e2e
+def test_coroutines_and_one_that_is_canceled_while_it_waits(
+    make: Make, client: Client, spec: Spec
+) -> None:
+    """A use that began for a caller that was gone was never ended."""
+    model = make()
+
+    async def story() -> None:
+        assert await asyncio.gather(*(model.later(x) for x in range(20))) == list(range(20))
+        other = await asyncio.to_thread(client.acquire, spec("other", 5, evictable=False))
+        other.ready()
+        waiting = asyncio.create_task(model.later(1))
+        await asyncio.to_thread(until, lambda: client.status().totals.waiting)
+        waiting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+        await asyncio.to_thread(other.give_up)
+
+    play(story)
+    until(lambda: model.loads == 2)
+    until(lambda: model.lease.uses == 0)
+
+
+def test_what_cannot_be_leased_is_refused_by_name() -> None:
+    class Bare:
+        def act(self) -> None: ...
+
+    class Late(Model):
+        async def load(self) -> None: ...  # type: ignore[override]
+
+    class Stream(Model):
+        def tokens(self) -> Iterator[str]:
+            yield ""
+
+    def task() -> None: ...
+
+    for made, told in (
+        (Bare, "Bare.load is not a plain method"),
+        (Late, "Late.load is not a plain method"),
+        (Stream, "Stream.tokens yields"),
+        (task, "task is a task without max_calls=1"),
+    ):
+        with pytest.raises(BadRequest, match=told):
+            leased(vram="5GiB", model="pi0")(made)
+    with pytest.raises(BadRequest, match="5GiB"):
+        leased(vram="5", model="pi0")(Model)
+
+
+def test_bytes_and_gpus_beside_a_lease_are_refused_by_name() -> None:
+    refuse_resources({"CPU": 1.0, "vram_arbiter": 0.001})
+    for name in ("num_gpus", "GPU", "vram_bytes"):
+        with pytest.raises(BadRequest, match=name):
+            refuse_resources([name])
+
+
+def test_methods_are_functions_to_their_core() -> None:
+    """Ray puts a signature on the innermost one; it refused classes without `__init__`."""
+
+    class Bare:
+        def load(self) -> None: ...
+
+        def unload(self) -> None: ...
+
+    for made in (Bare, Model):
+        kept = type(made.__name__, (made,), {})
+        assert inspect.isfunction(inspect.unwrap(leased(vram="5GiB", model="m")(kept).__init__))
+
+
+def test_only_idempotent_methods_are_sent_again() -> None:
+    class Policy(Model):
+        @idempotent
+        def act(self, x: int) -> int:
+            return x
+
+    made = leased(vram="5GiB", model="pi0")(Policy)
+    retries = {
+        name: vars(getattr(made, name))["__ray_max_task_retries__"] for name in ("act", "wait")
+    }
+    assert retries == {"act": -1, "wait": 0}
+    assert made.leased.need_bytes == 5 * GIB  # type: ignore[attr-defined]
+    assert made.leased.model == "pi0"  # type: ignore[attr-defined]
