@@ -181,13 +181,15 @@ def test_a_leased_task_ends_with_its_lease(boxes: Boxes) -> None:
 
 
 def test_seeds_without_a_result_are_named(boxes: Boxes, tmp_path: Path) -> None:
+    results: list[Result] = []
     with Fleet() as fleet:
-        actors = fleet.spread(Fragile)
-        results = []
+        played = fleet.map(
+            fleet.spread(Fragile), "episode", range(6), out=tmp_path, deadline_s=60.0,
+            on_result=results.append,
+        )  # fmt: skip
         with pytest.raises(SeedsFailed, match="3 seeds have no result") as failed:
-            for result in fleet.map(actors, "episode", range(6), out=tmp_path, deadline_s=60.0):
-                results.append(result.seed)
-    assert sorted(results) == [0, 4, 5]
+            list(played)
+    assert sorted(result.seed for result in results) == [0, 4, 5]
     told = failed.value.details["failed"]
     assert told["1"] == "ValueError: no such scene"
     assert told["2"].startswith("Actor")
