@@ -64,7 +64,8 @@ class Box:
 @dataclass(frozen=True, slots=True)
 class Story:
     """A load. `placements` and `per_s`: for each box. `hot`: share of them that ask for one model.
-    `dead`: boards that say nothing any more. `herd`: all placements come at one moment."""
+    `dead`: of BOARDS, each with its share of the boxes, which are unknown then. `herd`: all
+    placements come at one moment."""
 
     name: str
     placements: float = 2.0
@@ -76,13 +77,16 @@ class Story:
 
 
 STORIES: Final = (
-    Story("calm"),
-    Story("hot model", hot=0.5),
-    Story("dead board", dead=1),
+    Story("asked", stale_s=0.5),
+    Story("boards", stale_s=1.0),
+    Story("dead board", stale_s=1.0, dead=1),
     Story("stale views", stale_s=2.9),
+    Story("hot model", hot=0.5),
     Story("herd", placements=0.2, herd=True),
     Story("hot herd", placements=0.2, herd=True, hot=1.0),
 )
+"""`asked`: a driver asks 1,000 agents within half a second (measured: 0.5 ms each). `boards`: agents
+would push their views to BOARDS actors each second."""
 
 
 @dataclass(frozen=True, slots=True)

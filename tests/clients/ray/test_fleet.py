@@ -170,7 +170,8 @@ def test_an_actor_whose_wait_ends_is_placed_on_the_next_box(boxes: Boxes, fleet:
             order = [(one.box, one.reason) for one in fleet.order(6 * GIB, "waits")]
             assert order == [("n0", Reason.EVICTABLE), ("n1", Reason.BUSY)]
             placing = pool.submit(fleet.place, Waits)
-            until(lambda: busy.status().totals.waiting == 1)
+            until(lambda: placing.done() or busy.status().totals.waiting == 1)
+            assert not placing.done(), placing.exception()
             waited = [one.consumer for one in stuck.status().leases if one.state == "queued"]
             assert waited == []
         actor = placing.result(PATIENCE_S)
