@@ -126,6 +126,11 @@ class AsyncClient:
         return self._session.protocol.connection.epoch
 
     @property
+    def role(self) -> str | None:
+        """The role that the arbiter gave, `guest` behind a tunnel; None before the first answer."""
+        return self._session.protocol.connection.role
+
+    @property
     def leases(self) -> Sequence[AsyncLease]:
         """Leases that this client holds now."""
         return self._session.held

@@ -325,6 +325,11 @@ class Client(_Blocking[AsyncClient]):
         return self._twin.epoch
 
     @property
+    def role(self) -> str | None:
+        """The role that the arbiter gave, `guest` behind a tunnel; None before the first answer."""
+        return self._twin.role
+
+    @property
     def leases(self) -> Sequence[Lease]:
         """Leases that this client holds now."""
         return tuple(Lease(self._portal, lease) for lease in self._twin.leases)

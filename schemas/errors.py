@@ -211,6 +211,10 @@ class SidecarUnavailable(TransientError, code="sidecar_unavailable"):
     """A sidecar cannot be started or reached: `details.endpoint`."""
 
 
+class RemoteRefused(OperatorError, code="remote_refused"):
+    """ssh or the GPU server refuses a robot's tunnel: `details.host`, `reason`, `ssh`."""
+
+
 class CalibrationFailed(OperatorError, code="calibration_failed"):
     """A footprint could not be measured: `details.exit_code` of a program that failed."""
 

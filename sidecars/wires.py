@@ -11,6 +11,7 @@ actions.
 
 import functools
 import logging
+import os
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any, Literal, Protocol
@@ -23,6 +24,7 @@ from vram_arbiter.schemas.errors import (
     BadRequest,
     InternalError,
     LimitExceeded,
+    NotPermitted,
     UnknownOp,
     VramError,
 )
@@ -84,7 +86,7 @@ class Wire:
         reply: Reply
         try:
             call = parse(message, self._host.model_ops)
-            reply = await self._answer(call, message)
+            reply = await self._answer(peer, call, message)
             if of_field:
                 reply = _in_field_shape(name_of(call), reply)
         except VramError as error:
@@ -99,11 +101,12 @@ class Wire:
             reply = {**reply, "re": number}
         await self._send(peer, reply)
 
-    async def _answer(self, call: Call, message: Message) -> Message:
+    async def _answer(self, peer: Peer, call: Call, message: Message) -> Message:
         name = name_of(call)
         if name == "ping":
             return self._host.identity()
         if name == "shutdown":
+            _check_may_end(peer)
             self._host.stop()
             return {"ok": True}
         labels = {telemetry.ATTR_OPERATION: name}
@@ -142,6 +145,17 @@ class Wire:
             return await self._host.run(name, call, message)
         finally:
             self._pending -= 1
+
+
+def _check_may_end(peer: Peer) -> None:
+    """Raises NotPermitted for users other than root and the sidecar's own, and for the sidecar's
+    port: behind it every client has the sidecar's user."""
+    if peer.uid not in (0, os.getuid()) or peer.pid == os.getpid():
+        raise NotPermitted(
+            "only root and the sidecar's own user may end it, by its socket",
+            hint="stop its unit, or send the program SIGTERM",
+            details={"uid": peer.uid},
+        )
 
 
 def parse(message: Message, model_ops: frozenset[str]) -> Call:

@@ -180,6 +180,7 @@ class SessionTable:
                 return True
             session.heard_at = now
             roles.check(session.role, request)  # 4
+            by = _operator(session, request)
             for spec in _specs(request):
                 if spec.cgroup is not None:
                     known = self._settings.cgroup_root, self._settings.operators_gid
@@ -190,13 +191,7 @@ class SessionTable:
             if not session.leased and isinstance(request, _HOLDING):
                 self._registry.holds(session)
             self._decisions.post(
-                ev.Asked(
-                    session.client,
-                    request_id,
-                    request,
-                    envelope.traceparent,
-                    _operator(session, request),
-                )
+                ev.Asked(session.client, request_id, request, envelope.traceparent, by)
             )
         except codec.Undecodable as bad:
             self._refuse(connection, session, bad.request_id, bad.error.view())

@@ -69,13 +69,14 @@ class Above(Protocol):
 
 
 class Connection:
-    """`phase`, what the arbiter said of itself (`epoch`, `heartbeat_s`, `grace_s`), and what its
-    owner takes: `outgoing` messages and `events`."""
+    """`phase`, what the arbiter said (`epoch`, `role`, `heartbeat_s`, `grace_s`), and what its owner
+    takes: `outgoing` messages and `events`."""
 
     def __init__(self, above: Above, *, name: str, instance: str, role: w.Role) -> None:
         self.instance = instance
         self.phase = "down"
         self.epoch: int | None = None
+        self.role: str | None = None
         self.heartbeat_s = d.HEARTBEAT_S
         self.grace_s = d.FENCE_GRACE_S
         self.asked_at = 0.0
@@ -243,7 +244,7 @@ class Connection:
             return
         if self.phase == "greeting":
             welcome = from_map(WelcomeReply, message)
-            self.epoch = int(message["epoch"])
+            self.epoch, self.role = int(message["epoch"]), welcome.role
             self.heartbeat_s, self.grace_s = welcome.heartbeat_s, welcome.grace_s
             if kept := self._above.reattachments():
                 self.phase = "reattaching"

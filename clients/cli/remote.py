@@ -1,9 +1,27 @@
 """`vramctl remote`: a robot's tunnel to a GPU server, over OpenSSH."""
 
 import argparse
+import asyncio
+import os
+import signal
+import sys
+import time
+from pathlib import Path
 from typing import Final
 
-from vram_arbiter.clients.cli import authorize
+from vram_arbiter.clients.cli import authorize, text
+from vram_arbiter.clients.cli.arguments import add_json, count
+from vram_arbiter.clients.cli.replies import NO, OK, answer
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.net.link import is_listening
+from vram_arbiter.clients.remote import ssh
+from vram_arbiter.clients.remote.tunnel import Keeper
+from vram_arbiter.schemas.errors import AlreadyRunning, VramError
+from vram_arbiter.schemas.plain import Message
+from vram_arbiter.schemas.runtime.endpoints import IPC, SYSTEM_RUNTIME
+from vram_arbiter.schemas.runtime.folders import LockFile, private_folder
+from vram_arbiter.schemas.runtime.printable import makes_printable
+from vram_arbiter.schemas.runtime.systemd import Notifier
 
 DESCRIPTIONS = {
     "remote": "Use the models of a GPU server from a robot: its arbiter and its sidecars, over "
@@ -12,14 +30,173 @@ DESCRIPTIONS = {
 ACTIONS: Final = {
     "authorize": "On the server: let a robot's key in, for the arbiter, the sidecars and the doors "
     "that are named. Shows what the robot may then do, and what not.",
+    "up": "Keep the tunnel to a server, until it is ended. Ends at once, with a reason, if the "
+    "server refuses; after a loss it connects again.",
+    "status": "Show each tunnel of this user, and whether the server's arbiter answers.",
 }
+STATUS_S: Final = 3.0  # to be answered through a tunnel
 
 
 def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     commands = parser.add_subparsers(metavar="ACTION", required=True)
-    for name, add in (("authorize", authorize.add),):
+    for name, add in (
+        ("authorize", authorize.add),
+        ("up", _add_up),
+        ("status", _add_status),
+    ):
         add(commands.add_parser(name, help=ACTIONS[name], description=ACTIONS[name]))
 
 
 def run(args: argparse.Namespace) -> int:
     return int(args.action(args))
+
+
+# -- up
+def _add_up(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(action=_up)
+    parser.add_argument(
+        "host", metavar="HOST", help="[USER@]NAME[:PORT]; NAME may be a Host of ~/.ssh/config"
+    )
+    parser.add_argument("sidecars", metavar="SIDECAR", nargs="*", help="sidecars to forward")
+    parser.add_argument(
+        "--door",
+        type=_door,
+        action="append",
+        default=[],
+        metavar="PORT[:PORT]",
+        help="loopback port of a sidecar's door: here, and there if it differs",
+    )
+    parser.add_argument("--identity", type=Path, metavar="FILE", help="the robot's private key")
+    parser.add_argument(
+        "--known-hosts",
+        type=Path,
+        metavar="FILE",
+        help="the server's host key; any other is refused (default: "
+        "~/.config/vram-arbiter/known_hosts)",
+    )
+    parser.add_argument(
+        "--server-runtime",
+        default=SYSTEM_RUNTIME,
+        metavar="FOLDER",
+        help="the server's folder of sockets (default: %(default)s)",
+    )
+
+
+def _door(written: str) -> tuple[int, int]:
+    here, _, there = written.partition(":")
+    port = count(1, 65535)
+    return int(port(here)), int(port(there or here))
+
+
+def _config_home() -> Path:
+    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+
+
+def _up(args: argparse.Namespace) -> int:
+    """Keep the tunnel until SIGTERM or SIGINT. Raises RemoteRefused, ConfigError, AlreadyRunning."""
+    tunnel = ssh.Tunnel(
+        args.host,
+        ssh.folder_of(args.host, os.environ, os.getuid()),
+        args.known_hosts or _config_home() / "vram-arbiter/known_hosts",
+        tuple(args.sidecars),
+        tuple(args.door),
+        args.server_runtime,
+        args.identity,
+    )
+    tunnel.command()  # what is wrong with it, before a folder is made
+    private_folder(tunnel.folder.parent.parent, shared=True)
+    private_folder(tunnel.folder.parent)
+    private_folder(tunnel.folder)
+    lock = _lock(tunnel.folder)
+    lock.acquire()
+    try:
+        return asyncio.run(_keep(tunnel))
+    finally:
+        lock.release()
+
+
+def _lock(folder: Path) -> LockFile:
+    return LockFile(folder / "tunnel.lock", f"the tunnel to {ssh.host_of(folder)}", "a program")
+
+
+async def _keep(tunnel: ssh.Tunnel) -> int:
+    notifier = Notifier(os.environ)
+    keeper = Keeper(
+        tunnel,
+        say=lambda line: print(line, file=sys.stderr, flush=True),
+        up=lambda: notifier.ready("up"),
+        down=lambda: notifier.status("connecting"),
+    )
+    keeping = asyncio.ensure_future(keeper.keep())
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, keeping.cancel)
+    try:
+        await keeping
+    except asyncio.CancelledError:
+        notifier.stopping("asked to end")
+    return OK
+
+
+# -- status
+def _add_status(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(action=_status)
+    add_json(parser)
+
+
+def _status(args: argparse.Namespace) -> int:
+    """Return 0 if every tunnel is up, 1 if one is not or there is none."""
+    code, told = answer(_tunnels, as_json=args.as_json, lines=_lines)
+    up = [one["state"] == "up" for one in told["tunnels"]]
+    return code if up and all(up) else NO
+
+
+def _tunnels() -> Message:
+    place = ssh.tunnels_folder(os.environ, os.getuid())
+    folders = sorted(place.iterdir()) if place.is_dir() else []
+    return {"ok": True, "tunnels": [asyncio.run(_tunnel(folder)) for folder in folders]}
+
+
+async def _tunnel(folder: Path) -> Message:
+    """Return what is known of a tunnel: `state` (up, connecting, down), and if it is up what the
+    server's arbiter says."""
+    told: Message = {"host": ssh.host_of(folder), "state": "down", "sidecars": {}}
+    try:
+        _lock(folder).check_free()
+        return told
+    except AlreadyRunning:
+        told["state"] = "connecting"
+    sockets = _sockets(folder)
+    endpoint = sockets.pop(ssh.ARBITER, "")
+    if not endpoint or not is_listening(endpoint):
+        return told
+    try:
+        async with AsyncClient("vramctl", endpoint=endpoint, connect_timeout_s=STATUS_S) as arbiter:
+            began_s = time.monotonic()
+            await arbiter.ping(timeout_s=STATUS_S)
+            round_trip_ms = round(1e3 * (time.monotonic() - began_s), 2)
+            up = {"state": "up", "role": arbiter.role, "round_trip_ms": round_trip_ms}
+    except VramError as error:
+        return {**told, "problem": error.to_wire()}
+    return {**told, **up, "sidecars": sockets}
+
+
+def _sockets(folder: Path) -> dict[str, str]:
+    return {path.stem: f"{IPC}{path}" for path in sorted(folder.glob("*.sock"))}
+
+
+@makes_printable
+def _lines(told: Message) -> list[str]:
+    if not told["tunnels"]:
+        return ["no tunnel; `vramctl remote up HOST` makes one"]
+    columns = ("HOST", "STATE", "ROUND TRIP", "ROLE", "SIDECARS")
+    rows = [
+        (
+            one["host"],
+            one["state"],
+            f"{one['round_trip_ms']:g} ms" if "round_trip_ms" in one else "",
+            one.get("role", ""),
+            ", ".join(one["sidecars"]) or one.get("problem", {}).get("message", ""),
+        )
+        for one in told["tunnels"]
+    ]
+    return text.table(columns, rows)

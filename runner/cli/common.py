@@ -129,7 +129,7 @@ def check_sidecars(given: Mapping[str, str], manifests: Iterable[RSkillManifest]
     for name in given:
         if name not in installed:
             raise ConfigError(
-                f"--sidecar {name}: no such policy or detector is installed",
+                f"no such policy or detector is installed: {name}",
                 hint=f"there is {', '.join(installed) or 'none'}",
             )
 

@@ -12,7 +12,7 @@ import contextlib
 import logging
 import os
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from pathlib import Path
 
 from vram_arbiter.clients.client import AsyncClient
@@ -43,12 +43,13 @@ from vram_arbiter.runner.cli.deployment import (
     unused,
 )
 from vram_arbiter.runner.cli.display import add_display_flag, check_display_flag, display_runner
-from vram_arbiter.runner.cli.makers import MakeMakers, policy_makers
+from vram_arbiter.runner.cli.makers import MakeMakers, Models, policy_makers
 from vram_arbiter.runner.cli.recording import (
     check_recording,
     conclude_recording,
     record_into,
 )
+from vram_arbiter.runner.cli.servers import connect_servers, remote_sidecars
 from vram_arbiter.runner.cli.watching import Watch, slots_of, watches, watching
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.realtime import leaves_room, make_prompt
@@ -107,7 +108,7 @@ async def run(args: argparse.Namespace) -> int:
     file or flag, or a task that the emergency stop ended).
     """
     file = read_deployment(shipped(args.config, "robots", configs_folder(os.environ)))
-    return await Deploy(args, file, policy_makers(args, file)).run()
+    return await Deploy(args, file, policy_makers(file)).run()
 
 
 class Deploy:
@@ -134,13 +135,21 @@ class Deploy:
         manifests = read_manifests(self._args.skills or [default_skills()])
         if parts.teleoperator is not None:
             manifests.append(teleop.MANIFEST)
-        check = self._offered(parts, manifests, None)
         given = sidecars_given(self._args.sidecar)
+        check_sidecars(given, manifests)
+        remote = remote_sidecars(self._file, manifests, os.environ)
+        remote = {skill: ends for skill, ends in remote.items() if skill not in given}
+        given |= {skill: sidecar for skill, (sidecar, _) in remote.items()}
+        check = self._offered(parts, manifests, Models(given))
         self._watches = watches(self._file, manifests, given, os.environ)
         if self._file.robot.vla is not None:
             self._task_skill = skill_named(self._file.robot.vla, check.executable())
         if self._args.dry_run:
-            print(printable_lines(plan(self._file, parts, check, [*self._facts(check), *taken])))
+            print(
+                printable_lines(
+                    plan(self._file, parts, check, [*self._facts(check, given), *taken])
+                )
+            )
             print("dry run: nothing was opened")
             return 0
         for text in (*unkept(self._file, parts, check), *unused(self._file.robot)):
@@ -154,6 +163,7 @@ class Deploy:
             arbiter = (
                 None if self._args.no_arbiter else await connect_arbiter(self._args.arbiter, stack)
             )
+            models = Models(given, arbiter, await connect_servers(remote, stack))
             decoders = sum(getattr(one, "decodes_on_gpu", False) for one in parts.readers)
             gpu = cuda_uuid(0) if decoders else None  # where GStreamer's decoders run
             await stack.enter_async_context(
@@ -183,7 +193,7 @@ class Deploy:
                 await check_recording(recorder, control)
             await stack.enter_async_context(watching(self._watches, runner.robot, self._clock))
             await make_prompt(control, first=self._args.realtime and leaves_room(robot.rate_hz))
-            catalogue = self._offered(parts, manifests, arbiter)
+            catalogue = self._offered(parts, manifests, models)
             server = GoalServer(
                 self._endpoint,
                 control,
@@ -204,11 +214,8 @@ class Deploy:
         return code
 
     # -- steps
-    def _offered(
-        self, parts: Parts, manifests: list[RSkillManifest], arbiter: AsyncClient | None
-    ) -> Catalogue:
-        check_sidecars(sidecars_given(self._args.sidecar), manifests)
-        makers = self._make_makers(parts, arbiter)
+    def _offered(self, parts: Parts, manifests: list[RSkillManifest], models: Models) -> Catalogue:
+        makers = self._make_makers(parts, models)
         return offered(self._file, parts, manifests, makers, self._args.allow_noncommercial)
 
     def _taken(self) -> list[tuple[str, str]]:
@@ -222,8 +229,7 @@ class Deploy:
             return [("TAKEN", str(error))]
         return []
 
-    def _facts(self, catalogue: Catalogue) -> list[tuple[str, str]]:
-        given = sidecars_given(self._args.sidecar)
+    def _facts(self, catalogue: Catalogue, given: Mapping[str, str]) -> list[tuple[str, str]]:
         sidecars = [
             (
                 "sidecar",

@@ -4,13 +4,12 @@ operator's.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.runner.cli.common import sidecars_given
 from vram_arbiter.runner.cli.deployment import DeploymentFile, Parts, read_deployment
 from vram_arbiter.runner.goals.catalogue import Maker
 from vram_arbiter.runner.robots.so101 import lerobot_units_of
@@ -27,15 +26,25 @@ from vram_arbiter.schemas.runtime.extras import need
 if TYPE_CHECKING:
     from vram_arbiter.runner.sim.arm_env import ArmEnvironment
 
-MakeMakers = Callable[[Parts, AsyncClient | None], Mapping[Kind, Maker]]
-"""How skills of each kind are made for this robot, with or without an arbiter."""
+
+@dataclass(frozen=True, slots=True)
+class Models:
+    """Where policies are: addresses of sidecars by skill where one is given, this machine's arbiter
+    if there is one, and the arbiters of skills whose sidecars run on another machine."""
+
+    given: Mapping[str, str]
+    arbiter: AsyncClient | None = None
+    servers: Mapping[str, AsyncClient] = field(default_factory=dict)
 
 
-def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
+MakeMakers = Callable[[Parts, Models], Mapping[Kind, Maker]]
+"""How skills of each kind are made for this robot."""
+
+
+def policy_makers(file: DeploymentFile) -> MakeMakers:
     """Learnt policies, each in its sidecar, and what stands in for ROS 2 actions."""
-    given = sidecars_given(args.sidecar)
 
-    def make_makers(parts: Parts, arbiter: AsyncClient | None) -> Mapping[Kind, Maker]:
+    def make_makers(parts: Parts, models: Models) -> Mapping[Kind, Maker]:
         from vram_arbiter.runner.skills.makers import makers_of
 
         joints = parts.hal.description.joint_names
@@ -44,10 +53,11 @@ def policy_makers(args: argparse.Namespace, file: DeploymentFile) -> MakeMakers:
             parts.hal.description,
             lambda manifest: parts.gate.for_skill(manifest, ()).limits,
             parts.hal.sent,
-            given,
-            arbiter,
+            models.given,
+            models.arbiter,
             period_s=1.0 / file.robot.rate_hz,
             others={**ros_servers(file.robot), **operator_of(parts, 1.0 / file.robot.rate_hz)},
+            servers=models.servers,
         )
         return {**made, Kind.ROS_SERVICE: services}
 

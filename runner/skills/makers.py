@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from vram_arbiter.clients.sidecar.base import CALL_TIMEOUT_S
@@ -39,8 +40,11 @@ def makers_of(
     others: Mapping[str, StandIn],
     wait_s: float = 0.0,
     latency_steps: int | None = None,
+    servers: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[Kind, Maker]:
-    """Return the makers; `others` stand in for further interfaces, the rest as `SidecarPolicy`."""
+    """Return the makers; `others` stand in for further interfaces, the rest as `SidecarPolicy`.
+    `servers`: the arbiters of skills whose sidecars run on another machine.
+    """
 
     def make_policy(manifest: RSkillManifest) -> Skill:
         wiring = wire_up(manifest, robot, robot.rest_pose_rad)
@@ -48,7 +52,7 @@ def makers_of(
             manifest,
             wiring,
             client_of(wiring.rollout, sidecar_endpoint(manifest.name, given, os.environ)),
-            arbiter,
+            servers.get(manifest.name, arbiter),
             period_s=period_s,
             wait_s=wait_s,
             latency_steps=latency_steps,

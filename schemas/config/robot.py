@@ -172,6 +172,10 @@ class RobotEnvironment(_Section):
     """Cameras that are read together; null: each by itself."""
     detectors: tuple[DetectorConfig, ...] = ()
     """Detectors that look all the time, for the world state's `detected_objects`."""
+    sidecars: dict[Text, Annotated[str, Field(pattern=r"^ssh://[^/]+/[^/]+$")]] = {}
+    """Sidecars on a GPU server, by skill or by the sidecar's name: `grab: ssh://HOST/grab`. A
+    tunnel forwards them (`vramctl remote up HOST grab`); goals are uses at that server's arbiter.
+    """
     ros_actions: tuple[
         Literal["nav2_msgs/NavigateToPose", "control_msgs/FollowJointTrajectory"], ...
     ] = ()

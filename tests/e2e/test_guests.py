@@ -4,9 +4,11 @@ program or the network. Real sshd, daemon and clients; the robot has a network o
 
 import contextlib
 import os
+import shutil
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +26,7 @@ from tests.support.waiting import until
 from tests.support.wire import WireClient
 from vram_arbiter.clients.sync import Client, Lease
 from vram_arbiter.schemas.errors import RemoteMayNotHold
+from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE, SYSTEM_RUNTIME
 
 pytestmark = [
     pytest.mark.e2e,
@@ -53,6 +56,12 @@ def policy_server(there: Server) -> Iterator[tuple[Client, Lease]]:
         lease = policy.acquire(unload=lambda: None, **fields)
         lease.ready()
         yield policy, lease
+
+
+def begun_again(client: Client) -> list[str]:
+    """Return the labels of uses that were said again after a restart."""
+    events = client.history(kinds=["use_began"]).events
+    return [one["label"] for one in events if one["resumed"]]
 
 
 def uses(client: Client, lease: Lease) -> int:
@@ -184,6 +193,69 @@ def test_a_robot_that_comes_back_uses_anew(make_arbiter: Make, tmp_path: Path) -
         with robot.use(again.lease_id, again.token, "new"):
             until(lambda: uses(policy, again) == 1)
         until(lambda: uses(policy, again) == 0)
+
+
+@pytest.mark.nightly
+def test_a_guests_use_outlives_the_daemon(make_arbiter: Make, tmp_path: Path) -> None:
+    """The journal names sshd's process, and the robot says its use again through the tunnel."""
+    with (
+        server(make_arbiter, tmp_path) as there,
+        policy_server(there) as (policy, lease),
+        there.tunnel() as (_, endpoint),
+        Client("arm1", endpoint=endpoint) as robot,
+        robot.use(lease.lease_id, lease.token, "goal") as use,
+    ):
+        there.arbiter.kill()
+        there.arbiter.start()
+        assert uses(policy, lease) == 1
+        until(lambda: "goal" in begun_again(policy))
+        assert use.lost is None
+        use.end()
+        until(lambda: uses(policy, lease) == 0)
+
+
+@pytest.mark.nightly
+def test_guests_do_not_end_each_others_uses(make_arbiter: Make, tmp_path: Path) -> None:
+    users = (USER, "arm2")
+    with (
+        server(make_arbiter, tmp_path, users) as there,
+        policy_server(there) as (policy, lease),
+        there.tunnel(USER) as (_, one),
+        there.tunnel("arm2") as (_, two),
+        WireClient(one) as robot,
+        WireClient(two) as other,
+    ):
+        on = {"lease_id": lease.lease_id, "token": list(lease.token), "use_id": "goal"}
+        assert robot.hello().ask("use_begin", **on)["ok"]
+        assert other.hello().ask("use_end", **on)["ok"], "there is none of its own"
+        assert uses(policy, lease) == 1
+        there.sshd.kill("arm2")
+        assert robot.ask("use_end", **on)["uses"] == 0
+
+
+@pytest.mark.nightly
+def test_an_installed_key_is_that_of_a_user_in_both_groups(tmp_path: Path) -> None:
+    """`vramctl remote authorize --install` on a machine of its own: a copy of /etc."""
+    there = tmp_path / "etc"
+    shutil.copytree("/etc", there, symlinks=True)
+    with (there / "group").open("a") as groups:
+        groups.write("vram-arbiter:x:5901:\nvram-guests:x:5902:\n")
+    subprocess.run(
+        ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", tmp_path / "k"], check=True
+    )
+    command = ["remote", "authorize", str(tmp_path / "k.pub"), "--name", "arm1", "--install"]
+    program = [sys.executable, "-m", "vram_arbiter.clients", *command]
+    script = 'mount --bind "$0" /etc && "$@" && "$@" && id -nG vram-arm1'
+    done = subprocess.run(
+        ["unshare", "--mount", "sh", "-c", script, str(there), *program],
+        env=os.environ | {RUNTIME_VARIABLE: SYSTEM_RUNTIME},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert {"vram-arbiter", "vram-guests"} <= set(done.stdout.splitlines()[-1].split())
+    line = (there / "ssh/vram-guests/vram-arm1").read_text()
+    assert line.startswith('restrict,port-forwarding,permitopen="[/run/vram-arbiter/arbiter.sock]')
+    assert not Path("/etc/ssh/vram-guests/vram-arm1").exists()
 
 
 @pytest.mark.nightly

@@ -229,6 +229,7 @@ KINDS: Mapping[frozenset[str], Callable[[str], object]] = {
     frozenset({"policy_extras"}): lambda text: skill_of_block(**yaml.safe_load(text)),
     frozenset({"robot_id"}): lambda text: load_robot(text, "page"),
     frozenset({"sensors"}): lambda text: robot_of_block(**yaml.safe_load(text)),
+    frozenset({"sidecars"}): lambda text: robot_of_block(**yaml.safe_load(text)),
     frozenset({"model", "ends"}): lambda text: robot_of_block(
         hal={"adapter": "mujoco", "params": yaml.safe_load(text)}
     ),

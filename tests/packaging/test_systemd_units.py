@@ -41,6 +41,7 @@ EXPOSURES_MAX = {
     # The tool counts what only a privileged manager can restrict, as if a user's manager could.
     "user/vram-arbiter.service": 6.2,
     "user/vram-reasoner.service": 6.5,
+    "user/vram-remote@.service": 6.4,
     "user/vram-gateway.service": 9.6,  # it starts containers of the user, without limits
 }
 """Figures of systemd 252. Each unit is at most 0.1 below its limit, so that a setting that goes
@@ -93,7 +94,13 @@ def test_verify_is_silent(installed: Path, name: str) -> None:
 
 @needs_analyze
 @pytest.mark.parametrize(
-    "name", ["vram-arbiter.service", "vram-reasoner.service", "vram-gateway.service"]
+    "name",
+    [
+        "vram-arbiter.service",
+        "vram-reasoner.service",
+        "vram-remote@.service",
+        "vram-gateway.service",
+    ],
 )
 def test_verify_is_silent_about_the_user_instance(
     installed: Path, tmp_path: Path, name: str

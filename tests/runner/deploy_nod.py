@@ -10,10 +10,10 @@ import sys
 from collections.abc import Mapping
 
 from tests.runner.small_robots import Nod
-from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.runner.__main__ import parse
 from vram_arbiter.runner.cli.deploy import Deploy
 from vram_arbiter.runner.cli.deployment import Parts, read_deployment
+from vram_arbiter.runner.cli.makers import Models
 from vram_arbiter.runner.goals.catalogue import Maker
 from vram_arbiter.schemas.errors import ConfigError, EstopRequested, VramError
 from vram_arbiter.schemas.manifest import Kind
@@ -22,7 +22,7 @@ STEPS = os.environ.get("NOD_STEPS")
 CAMERAS = tuple(filter(None, os.environ.get("NOD_CAMERAS", "").split(",")))
 
 
-def makers(parts: Parts, arbiter: AsyncClient | None) -> Mapping[Kind, Maker]:
+def makers(parts: Parts, models: Models) -> Mapping[Kind, Maker]:
     steps = int(STEPS) if STEPS else None
     return {
         Kind.ROS_ACTION: lambda manifest: Nod(

@@ -3,6 +3,7 @@ may send."""
 
 import asyncio
 import io
+import os
 import socketserver
 
 import msgpack
@@ -50,7 +51,7 @@ class Host:
         self.calls.append(("stop",))
 
 
-def talk(*messages, answer=None):
+def talk(*messages, answer=None, peer=PEER):
     """Handle messages one after the other; returns the replies and the host."""
 
     async def run():
@@ -64,7 +65,7 @@ def talk(*messages, answer=None):
 
         wire = Wire(host, send)
         for message in messages:
-            await wire.handle(PEER, message)
+            await wire.handle(peer, message)
         return replies, host
 
     return asyncio.run(run())
@@ -90,6 +91,20 @@ def test_both_families_reach_the_host():
     assert isinstance(host.calls[2][1], DetectOp)
     assert host.calls[2][1].token == (1, 2)
     assert isinstance(host.calls[3][1], EndpointCall)
+
+
+def test_others_of_the_group_do_not_end_it():
+    """A robot behind ssh ended the model of all robots."""
+    own, behind_its_port = os.getuid(), os.getpid()
+    for peer, ends in (
+        (Peer(1, 7, 0), True),
+        (Peer(1, 7, own), True),
+        (Peer(1, 7, 54_321), False),
+        (Peer(1, behind_its_port, own), False),
+    ):
+        (reply,), host = talk({"op": "shutdown"}, peer=peer)
+        assert (reply["ok"], host.calls) == ((True, [("stop",)]) if ends else (False, []))
+        assert ends or reply["code"] == "not_permitted"
 
 
 @pytest.mark.parametrize(

@@ -179,10 +179,12 @@ def test_a_user_installs_upgrades_and_removes(
     assert systemctl.read_text() == "--user daemon-reload\n"
     systemctl.unlink()
     assert run_main(["uninstall", "--user-units", "--yes"]) == 0
-    names = "vram-gateway.service vram-reasoner.service vram-arbiter.service"
+    names = "vram-gateway.service vram-reasoner.service vram-remote@*.service vram-arbiter.service"
     assert systemctl.read_text().splitlines() == [
-        f"--user stop {names}", f"--user disable {names}", "--user daemon-reload",
-    ]  # fmt: skip
+        f"--user stop {names}",
+        f"--user disable {names.replace('@*', '@')}",
+        "--user daemon-reload",
+    ]
     systemctl.unlink()
     assert run_main(["uninstall", "--user-units", "--yes"]) == 0
     assert not systemctl.exists()

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from tests.support.process import vramctl
-from vram_arbiter.clients.remote import authorize
 from vram_arbiter.clients.remote.authorize import Guest, read_key
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE, SYSTEM_RUNTIME
 
 
 def key(kind: str = "ssh-ed25519", body: bytes = bytes(36)) -> str:
@@ -25,7 +25,7 @@ def test_a_line_names_all_that_is_reached() -> None:
     )
 
 
-@pytest.mark.parametrize("kind", authorize.KINDS)
+@pytest.mark.parametrize("kind", ["ssh-ed25519", "sk-ssh-ed25519@openssh.com", "ssh-rsa"])
 def test_a_keys_remark_is_not_kept(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "k.pub"
     path.write_text(f"\n{key(kind)}   somebody, somewhere\n")
@@ -36,15 +36,14 @@ def test_a_keys_remark_is_not_kept(tmp_path: Path, kind: str) -> None:
     ("text", "problem"),
     [
         ("-----BEGIN OPENSSH PRIVATE KEY-----\n", "is a private key, which stays on the robot"),
-        ("", "expected one public key, got 0 lines"),
-        (f"{key()} a\n{key()} b\n", "expected one public key, got 2 lines"),
-        (f'command="id" {key()}', "expected a key of ssh-ed25519"),
-        ("ssh-dss AAAA", "expected a key of ssh-ed25519"),
-        ("ssh-ed25519 AAAA=A", "the key is damaged"),
-        ("ssh-ed25519", "the key is damaged"),
+        ("", "expected one public key"),
+        (f"{key()} a\n{key()} b\n", "expected one public key"),
+        (f'command="id" {key()}', "expected one public key"),
+        ("ssh-ed25519 AAAA=A", "expected one public key"),
+        ("ssh-ed25519", "expected one public key"),
         (key().replace("ssh-ed25519", "ssh-rsa"), "its body is not of ssh-rsa"),
         (key(body=b""), "its body is not of ssh-ed25519"),
-        ("\x00\udcff", "cannot be read as a public key"),
+        ("\x00\udcff", "expected one public key"),
     ],
 )
 def test_what_is_no_key(tmp_path: Path, text: str, problem: str) -> None:
@@ -56,7 +55,7 @@ def test_what_is_no_key(tmp_path: Path, text: str, problem: str) -> None:
 
 
 def test_no_file() -> None:
-    with pytest.raises(ConfigError, match="cannot be read as a public key"):
+    with pytest.raises(ConfigError, match="expected one public key"):
         read_key(Path("/nowhere/k.pub"))
 
 
@@ -74,7 +73,7 @@ def test_it_says_what_the_robot_may_and_what_to_run(tmp_path: Path) -> None:
         "--door",
         "8000",
     ]
-    told = vramctl(*command, environ=os.environ)
+    told = vramctl(*command, environ=os.environ | {RUNTIME_VARIABLE: SYSTEM_RUNTIME})
     assert told.returncode == 0, told.stderr
     lines = told.stdout.splitlines()
     assert lines[0] == Guest("arm1", key(), ("grab",), (8000,)).line
@@ -88,7 +87,7 @@ def test_it_says_what_the_robot_may_and_what_to_run(tmp_path: Path) -> None:
     [
         ["--name", "Arm 1"],
         ["--name", "a", "--sidecar", 'x"y'],
-        ["--name", "a", "--runtime", "/a]b"],
+        ["--name", "a", "--door", "0"],
     ],
 )
 def test_what_would_change_the_line_is_refused(wrong: list[str]) -> None:
@@ -107,5 +106,5 @@ def test_a_damaged_key_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_user_that_exists_is_put_into_the_groups() -> None:
-    (command,) = Guest("arm1", key()).commands(exists=True)
-    assert command == ["usermod", "--append", "--groups", "vram-arbiter,vram-guests", "vram-arm1"]
+    _, joined = Guest("arm1", key()).commands()
+    assert joined == ["usermod", "--append", "--groups", "vram-arbiter,vram-guests", "vram-arm1"]

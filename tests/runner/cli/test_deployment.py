@@ -4,6 +4,7 @@ fits the robot, the dry run.
 
 import os
 import re
+import socket
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 from vram_arbiter.runner.__main__ import main, parse
 from vram_arbiter.runner.cli.deployment import make_parts, read_deployment
+from vram_arbiter.runner.cli.servers import remote_sidecars
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import load_manifest
@@ -163,6 +165,36 @@ def test_each_misfit_of_the_tasks_skill_is_a_line_of_its_own(
     assert len(said) == 2, err
     assert "slots[0].control_mode: so101 has no base to drive" in said[0]
     assert "slots[1].range: covers 3 values for 6 joints" in said[1]
+
+
+def test_a_sidecar_of_a_server_needs_its_tunnel(dry_run: DryRun) -> None:
+    """What `--check` passes can run: without a tunnel that is up nothing would answer."""
+    text = TWIN + CAMERAS + "sidecars: {grab: %s}\n"
+    code, _, err = dry_run(text % "ssh://arm1@box/grab", skills=GRAB)
+    assert code == 1, "a retry may succeed"
+    assert "no tunnel to arm1@box forwards grab" in err
+    assert "vramctl remote up arm1@box grab" in err
+    for wrong in ("ipc:///run/grab.sock", "ssh://box", "ssh://-o/grab"):
+        code, _, err = dry_run(text % wrong, skills=GRAB)
+        assert (code, "sidecars.grab" in err) == (2, True), err
+    code, _, err = dry_run(TWIN + "sidecars: {grb: ssh://box/grab}\n", skills=GRAB)
+    assert (code, "robot.yaml:3: sidecars.grb: no such policy" in err) == (2, True), err
+
+
+def test_a_sidecar_of_a_server_is_used_at_its_arbiter(tmp_path: Path) -> None:
+    """The robot's own arbiter does not know that lease."""
+    folder = tmp_path / "remote/box"
+    folder.mkdir(parents=True)
+    (tmp_path / "robot.yaml").write_text(TWIN + "sidecars: {grab: ssh://box/grab}\n")
+    file = read_deployment(tmp_path / "robot.yaml")
+    with socket.socket(socket.AF_UNIX) as arbiter, socket.socket(socket.AF_UNIX) as grab:
+        for listener, name in ((arbiter, "arbiter"), (grab, "grab")):
+            listener.bind(str(folder / f"{name}.sock"))
+            listener.listen()
+        environ = {"VRAM_ARBITER_RUNTIME": str(tmp_path)}
+        remote = remote_sidecars(file, [load_manifest(GRAB)], environ)
+    ends = (f"ipc://{folder}/grab.sock", f"ipc://{folder}/arbiter.sock")
+    assert remote == {"vram-arbiter/so101-grab": ends}
 
 
 def test_a_policys_vectors_are_told_where_it_fits(dry_run: DryRun) -> None:

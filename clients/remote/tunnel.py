@@ -1,0 +1,212 @@
+"""Keep a tunnel: start ssh, see that a server greets behind every socket, start again after a loss.
+
+ssh tells by a line that it listens, and by its end that the network is gone. A refusal (a host key,
+the robot's key, a forwarding) would be the next attempt's too: it ends the keeper. Must not know
+what is said on the sockets.
+"""
+
+import asyncio
+import os
+import re
+from asyncio.subprocess import DEVNULL, PIPE, Process
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Never
+
+from vram_arbiter.clients.foreign.program import dying_with_parent
+from vram_arbiter.clients.remote.ssh import FORWARDED, Tunnel
+from vram_arbiter.schemas.errors import ConfigError, RemoteRefused
+from vram_arbiter.schemas.runtime.printable import printable
+
+RETRY_S: Final = 0.5
+"""The first pause after a loss; the next is twice as long, until a tunnel is up again …"""
+RETRY_MAX_S: Final = 10.0  # … and the longest
+GREETING_S: Final = 5.0
+"""How long a server may take to greet: it does so at once, before it is asked anything."""
+CONNECT_S: Final = 30.0
+"""For ssh to listen; it looks for signs of life only from then on."""
+LAST_WORDS_S: Final = 1.0
+WORDS_MAX: Final = 20  # lines of ssh that are looked at
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """What ssh says of one. `lasting`: also of a server that was reached before; a machine that
+    starts has its sshd before its sockets."""
+
+    said: str
+    reason: str
+    hint: str
+    lasting: bool = True
+
+
+REFUSALS: Final = (
+    Refusal(
+        "REMOTE HOST IDENTIFICATION HAS CHANGED",
+        "host_key_changed",
+        "another machine answers, or the server was set up anew: ask its operator, then replace "
+        "its line in {known_hosts}",
+    ),
+    Refusal(
+        "Host key verification failed",
+        "host_key_unknown",
+        "`ssh-keyscan {scan} >> {known_hosts}`, once its `ssh-keygen -lf {known_hosts}` is what "
+        "the server's operator reads from /etc/ssh/ssh_host_ed25519_key.pub",
+    ),
+    Refusal(
+        r"Permission denied \(|Too many authentication failures",
+        "key_refused",
+        "on the server: `vramctl remote authorize`, with this robot's public key and this user",
+    ),
+    Refusal(
+        "is not served there",  # sshd does not tell why: its log does
+        "not_served",
+        "on the server: is it started, in the folder of --server-runtime, is the user in the group "
+        "vram-arbiter, and may its key forward? see sshd's log",
+        lasting=False,
+    ),
+    Refusal(
+        r"Address already in use|cannot listen to port|Could not request local forwarding",
+        "not_forwarded",
+        "another program of this robot has the port",
+    ),
+)
+
+
+def refusal(tunnel: Tunnel, words: Sequence[str], *, reached: bool) -> RemoteRefused | None:
+    """Return the refusal that ssh's words tell of. `reached`: the tunnel was up before."""
+    for one in REFUSALS:
+        found = [line for line in words if re.search(one.said, line)]
+        if found and (one.lasting or not reached):
+            host = next(filter(None, map(_scanned, words)), tunnel.host)
+            return RemoteRefused(
+                f"{tunnel.host} refuses the tunnel: {found[0].strip('@ ')}",
+                hint=one.hint.format(known_hosts=tunnel.known_hosts, scan=host),
+                details={"host": tunnel.host, "reason": one.reason, "ssh": list(words)},
+            )
+    return None
+
+
+def _scanned(line: str) -> str:
+    """Return ssh-keyscan's arguments for the server that a line of ssh says is unknown."""
+    found = re.search(r"host key is known for (?:\[(\S+)\]:(\d+)|(\S+))", line)
+    if found is None:
+        return ""
+    return found[3] or f"-p {found[2]} {found[1]}"
+
+
+class Keeper:
+    """`keep` runs until it is canceled, or the server refuses. `say` gets lines for people, `up`
+    and `down` are called as the tunnel comes and goes."""
+
+    def __init__(
+        self,
+        tunnel: Tunnel,
+        say: Callable[[str], object],
+        up: Callable[[], object] = lambda: None,
+        down: Callable[[], object] = lambda: None,
+    ) -> None:
+        self._tunnel = tunnel
+        self._say = say
+        self._up = up
+        self._down = down
+        self._words: deque[str] = deque(maxlen=WORDS_MAX)
+        self._reached = self._is_up = False
+
+    async def keep(self) -> Never:
+        """Raises RemoteRefused, ConfigError."""
+        pause_s = RETRY_S
+        while True:
+            self._words.clear()
+            if await self._one():
+                self._reached, pause_s = True, RETRY_S
+            elif error := refusal(self._tunnel, self._words, reached=self._reached):
+                raise error
+            why = self._words[-1] if self._words else "ssh ended"
+            self._say(f"no tunnel to {self._tunnel.host}: {why}; again in {pause_s:g} s")
+            await asyncio.sleep(pause_s)
+            pause_s = min(2 * pause_s, RETRY_MAX_S)
+
+    async def _one(self) -> bool:
+        """Run one ssh to its end, with its last lines in `_words`. Return whether the tunnel was
+        up."""
+        async with self._ssh() as ssh:
+            if problem := await self._unready(ssh):
+                self._words.append(problem)
+                return False
+            self._say(f"tunnel to {self._tunnel.host} is up: {', '.join(self._tunnel.names)}")
+            self._is_up = True
+            self._up()
+            try:
+                await ssh.wait()
+            finally:
+                self._is_up = False
+                self._down()
+            return True
+
+    async def _unready(self, ssh: Process) -> str:
+        """Return why the tunnel is not up, beside what ssh says of it; "": it is."""
+        assert ssh.stdout is not None
+        try:
+            async with asyncio.timeout(CONNECT_S):
+                said = await ssh.stdout.readline()
+        except TimeoutError:
+            return f"no connection within {CONNECT_S:g} s"
+        if said.decode().strip() != FORWARDED:
+            return "ssh ended"
+        problems = [await _unserved(self._tunnel.socket(name)) for name in self._tunnel.names]
+        return "; ".join(filter(None, problems))
+
+    @asynccontextmanager
+    async def _ssh(self) -> AsyncIterator[Process]:
+        """A running ssh; at the end it has ended, and its sockets are removed."""
+        try:
+            ssh = await asyncio.create_subprocess_exec(
+                *self._tunnel.command(),
+                stdin=DEVNULL,
+                stdout=PIPE,
+                stderr=PIPE,
+                # ssh starts its ProxyCommand by it; a service's user has one that starts nothing
+                env={**os.environ, "SHELL": "/bin/sh"},
+                preexec_fn=dying_with_parent(),
+            )
+        except FileNotFoundError as error:
+            raise ConfigError("there is no ssh", hint="apt install openssh-client") from error
+        hearing = asyncio.create_task(self._hear(ssh))
+        try:
+            yield ssh
+        finally:
+            if ssh.returncode is None:
+                ssh.terminate()
+            await ssh.wait()
+            await asyncio.wait([hearing], timeout=LAST_WORDS_S)
+            hearing.cancel()
+            for name in self._tunnel.names:
+                self._tunnel.socket(name).unlink(missing_ok=True)
+
+    async def _hear(self, ssh: Process) -> None:
+        assert ssh.stderr is not None
+        async for line in ssh.stderr:
+            if text := printable(line.decode(errors="replace").strip()):
+                self._words.append(text)
+                if self._is_up:  # such as a channel that the server refuses
+                    self._say(f"{self._tunnel.host}: {text}")
+
+
+async def _unserved(path: Path) -> str:
+    """Return why no server greets behind a forwarded socket; "": one does."""
+    try:
+        async with asyncio.timeout(GREETING_S):
+            reader, writer = await asyncio.open_unix_connection(path)
+            try:
+                greeted = await reader.read(1)
+            finally:
+                writer.close()
+    except TimeoutError:
+        return f"{path.stem} is silent"
+    except OSError as error:
+        return f"{path.stem}: {error.strerror}"
+    return "" if greeted else f"{path.stem} is not served there"

@@ -1,0 +1,149 @@
+"""A policy of a GPU server, through a real tunnel: a goal is a use at the server's arbiter, and the
+robot stops by its own clock when the tunnel is killed or silent.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.runner.skills.policy_bench import MANIFEST, Bench, Sidecar
+from tests.support.guests import USER
+from tests.support.process import Make
+from tests.support.remote import Remote
+from tests.support.waiting import eventually
+from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.lease import AsyncLease
+from vram_arbiter.clients.net.server import Peer
+from vram_arbiter.runner.protocols import Act, Goal, Hold
+from vram_arbiter.runner.skills import sidecar_policy
+from vram_arbiter.schemas.errors import SidecarUnavailable
+from vram_arbiter.schemas.manifest import parse_manifest
+from vram_arbiter.schemas.plain import Message
+
+pytestmark = [pytest.mark.anyio, pytest.mark.heavy, pytest.mark.e2e, pytest.mark.nightly]
+
+GOAL = Goal("g1", "test/arm-grab", prompt="grab the red cube", deadline_s=60.0)
+HUNG_S = 1.0
+
+
+class Leased(Sidecar):
+    """Its model has a lease at the server's arbiter."""
+
+    lease: AsyncLease
+
+    async def handle(self, peer: Peer, message: Message) -> None:
+        if message["endpoint"] == "load":
+            told = {"lease_id": self.lease.lease_id, "token": list(self.lease.token)}
+            await self.server.send(peer, {"re": message["id"], "ok": True, "loaded": True, **told})
+        else:
+            await super().handle(peer, message)
+
+
+@dataclass
+class Robot:
+    """A policy's bench, whose sidecar and arbiter are on the server."""
+
+    bench: Bench
+    server: AsyncClient
+    remote: Remote
+
+    async def uses(self) -> int:
+        return sum(lease.uses for lease in (await self.server.status()).leases)
+
+    async def no_uses(self) -> None:
+        async with asyncio.timeout(60):
+            while await self.uses():
+                await asyncio.sleep(0.01)
+
+
+@pytest.fixture
+async def robot(
+    make_arbiter: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> AsyncIterator[Robot]:
+    for name in ("HUNG_MIN_S", "HUNG_FIRST_MIN_S", "HUNG_WAITING_MIN_S"):
+        monkeypatch.setattr(sidecar_policy, name, HUNG_S)
+    sidecar = Leased()
+    with Remote(make_arbiter, tmp_path) as remote:
+        async with (
+            AsyncClient("grab", endpoint=remote.arbiter.endpoint) as server,
+            server.lease(vram="1GiB", model="pi0", unload=lambda: None) as sidecar.lease,
+            sidecar.served(f"ipc://{remote.arbiter.runtime}/grab.sock"),
+        ):
+            await sidecar.lease.ready()
+            await asyncio.to_thread(remote.up, "grab")
+            async with AsyncClient("runner", endpoint=remote.endpoint) as guest:
+                manifest = parse_manifest(MANIFEST)
+                endpoint = f"ipc://{remote.folder}/grab.sock"
+                bench = Bench(manifest, endpoint, guest, wait_s=0.0)  # type: ignore[arg-type]
+                bench.sidecar = sidecar
+                yield Robot(bench, server, remote)
+                await bench.skill.finish()
+                await bench.client.close()
+
+
+async def first_action(bench: Bench) -> None:
+    while not isinstance(await bench.step(), Act):
+        pass
+
+
+async def held(bench: Bench) -> None:
+    while True:
+        assert isinstance(await bench.step(), Hold)
+
+
+async def test_a_goal_is_a_use_at_the_servers_arbiter(robot: Robot) -> None:
+    await robot.bench.skill.start(GOAL)
+    assert await robot.uses() == 1
+    await first_action(robot.bench)
+    await robot.bench.skill.finish()
+    await robot.no_uses()
+
+
+async def test_a_killed_tunnel_ends_the_goal_at_once_and_the_next_begins_anew(
+    robot: Robot,
+) -> None:
+    bench = robot.bench
+    await bench.skill.start(GOAL)
+    await first_action(bench)
+    robot.remote.sshd.kill(USER)
+    await robot.no_uses()
+    await eventually(lambda: not bench.client.connected)
+    with pytest.raises(SidecarUnavailable, match="lost within the goal"):
+        await bench.step()
+    await bench.skill.finish()
+    played, chunks = len(bench.played), len(bench.sidecar.observations)
+
+    await eventually(lambda: bench.arbiter.connected)  # type: ignore[union-attr]
+    await bench.skill.start(GOAL)
+    assert await robot.uses() == 1, "a new use"
+    assert isinstance(await bench.step(), Hold), "nothing of the old chunk"
+    assert len(bench.played) == played
+    await first_action(bench)
+    assert len(bench.sidecar.observations) == chunks + 1, "a new chunk, of a new picture"
+
+
+async def test_a_silent_tunnel_stops_the_robot_at_the_end_of_its_chunk(robot: Robot) -> None:
+    bench = robot.bench
+    await bench.skill.start(GOAL)
+    await first_action(bench)
+    robot.remote.sshd.freeze(USER)
+    try:
+        outcomes = [await bench.step() for _ in range(3)]
+        assert [type(one) for one in outcomes] == [Act, Act, Hold], "the rest of its chunk"
+        with pytest.raises(SidecarUnavailable, match="hangs: no chunk within"):
+            await held(bench)
+        await bench.skill.finish()
+    finally:
+        robot.remote.sshd.unfreeze(USER)
+    played = len(bench.played)
+    await robot.no_uses()
+
+    await eventually(lambda: bench.arbiter.connected)  # type: ignore[union-attr]
+    await bench.skill.start(GOAL)
+    assert await robot.uses() == 1
+    assert isinstance(await bench.step(), Hold)
+    assert isinstance(await bench.step(), Hold), "the late answer is not played"
+    assert len(bench.played) == played
