@@ -22,6 +22,7 @@ ATTEMPTS_MAX: Final = 3
 AWAY_MAX_S: Final = 120.0
 """Beside a call's deadline, how long all actors may be refused or not answer: a node's death is
 noticed within 30 s, and a busy machine starts an actor within a minute."""
+DEATHS_MAX: Final = 2
 PAUSE_S: Final = 0.5
 """Before an actor that failed is asked again."""
 NAMED_MAX: Final = 10
@@ -95,6 +96,8 @@ class _Worker:
     sent: Any = None
     due_at: float = 0.0
     """When the call is late; without a call: when the next one may be sent."""
+    deaths: int = 0
+    """How often in a row it was said to be dead when it was asked: once may be a restart."""
 
 
 def map_results(
@@ -123,7 +126,7 @@ def map_results(
 
 @dataclass(slots=True)
 class _Mapping:
-    workers: Sequence[_Worker]
+    workers: list[_Worker]
     method: str
     seeds: Seeds
     out: Path
@@ -135,9 +138,10 @@ class _Mapping:
     def run(self) -> Iterator[Result]:
         away_max_s = AWAY_MAX_S + self.deadline_s
         while self.seeds or any(worker.seed is not None for worker in self.workers):
-            if not self.workers or time.monotonic() - self.ended_at > away_max_s:
+            away_s = time.monotonic() - self.ended_at
+            if self.seeds and (not self.workers or away_s > away_max_s):
                 self.seeds.strand(f"no actor answers: {self.last_seen}")
-                return
+                continue
             for worker in self.workers:
                 if worker.sent is None and self.seeds and time.monotonic() >= worker.due_at:
                     self._send(worker, "__ray_call__", _node, away_max_s)
@@ -187,10 +191,13 @@ class _Mapping:
                 self._fail(seed, error.cause)
         except exceptions.RayError as error:
             self._lost(worker, seed, error)
+            worker.deaths += seed is None and isinstance(error, exceptions.ActorDiedError)
+            if worker.deaths == DEATHS_MAX:
+                self.workers.remove(worker)
         else:
             if seed is not None:
                 return self._committed(Result(seed, worker.node, value))
-            worker.node = value
+            worker.node, worker.deaths = value, 0
             if self.seeds:
                 worker.seed = self.seeds.take()
                 self._send(worker, self.method, worker.seed, self.deadline_s)

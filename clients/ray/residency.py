@@ -175,11 +175,13 @@ class Residency:
             interval.end()
 
     def _loaded(self) -> Lease:
-        if self._lease is not None and (self._lease.revoking or self._lease.state == "gone"):
-            self._lease.wait_gone()  # and for its unload
-            self._lease = None
-        if self._lease is None:
-            self._lease = self._load()
+        lease = self._lease
+        while lease is not None and lease.revoking:  # which may be withdrawn
+            lease.wait_change(lease.state)
+        if lease is not None and lease.state == "gone":
+            lease.wait_gone()  # and for its unload
+            lease = None
+        self._lease = lease or self._load()
         return self._lease
 
     def _load(self) -> Lease:

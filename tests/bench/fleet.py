@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.bench.harness import Suite, elapsed_us, in_turns, p50, pause, summed
+from tests.bench.tunnel import tunnel_rows
 from tests.e2e.test_guests import policy_server, seconds_until_the_grant, uses
 from tests.support.boxes import Box, Boxes
 from tests.support.episodes import Bare, BareAsync, Caller, CallerAsync, SmallPlayer
@@ -36,7 +37,8 @@ SCALING = {2: 0.95, 4: 0.9}
 KILLED_AT = 12
 DEADLINE_S = 120.0
 REPLACED_S, BACK_S, SILENT_S = 30.0, 0.3, 5.0
-SILENT_ROW = "network silent -> other model granted"
+BY_SSH = ("tunnel", "silent-network")
+"""Subjects that start an sshd."""
 
 
 @contextmanager
@@ -164,9 +166,6 @@ def bytes_back(suite: Suite) -> None:
 def silent_network(suite: Suite) -> None:
     """From the last packet of a robot behind ssh to the grant of the model that waited for its use
     to end."""
-    if why := unavailable():
-        suite.skipped(SILENT_ROW, why)
-        return
     with ExitStack() as stack:
 
         def make(*arguments: Any, **named: Any) -> ArbiterProcess:
@@ -182,7 +181,7 @@ def silent_network(suite: Suite) -> None:
         stack.enter_context(robot.use(lease.lease_id, lease.token, "goal"))
         until(lambda: uses(policy, lease) == 1)
         took_s = seconds_until_the_grant(there, policy, lease, there.sshd.silence)
-    suite.figure(SILENT_ROW, took_s, "s", at_most=SILENT_S)
+    suite.figure("network silent -> other model granted", took_s, "s", at_most=SILENT_S)
 
 
 SUBJECTS = {
@@ -190,6 +189,7 @@ SUBJECTS = {
     "scaling": scaling,
     "node-death": node_death,
     "bytes-back": bytes_back,
+    "tunnel": tunnel_rows,
     "silent-network": silent_network,
 }
 
@@ -204,6 +204,9 @@ def main() -> int:
     options = parser.parse_args()
     suite = Suite(quick=options.quick)
     for name in options.only or SUBJECTS:
+        if name in BY_SSH and (why := unavailable()):
+            suite.skipped(name, why)
+            continue
         began = time.monotonic()
         SUBJECTS[name](suite)
         print(f"{name}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)

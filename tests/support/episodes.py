@@ -69,6 +69,17 @@ class SmallPlayer(Episodes):
     """Three fit."""
 
 
+class Fragile:
+    """Raises at seed 1, dies at seed 2, and answers seed 3 with what JSON cannot say."""
+
+    def episode(self, seed: int) -> object:
+        if seed == 1:
+            raise ValueError("no such scene")
+        if seed == 2:
+            os._exit(1)
+        return {seed} if seed == 3 else seed
+
+
 def note(folder: Path, what: str, seed: int, begun: float, now: float) -> None:
     """Append one line for this process; another one writes another file."""
     line = {"seed": seed, "pid": os.getpid(), "begun": begun, "t": now}

@@ -15,12 +15,12 @@ from typing import Any
 import pytest
 
 from tests.support.boxes import MARKER, Boxes
-from tests.support.episodes import Player, freed_inside, noted
+from tests.support.episodes import Fragile, Player, freed_inside, noted
 from tests.support.fakegpu_check import check_log
 from tests.support.processes import alive
 from tests.support.waiting import until
 from vram_arbiter.clients.ray import Fleet, leased
-from vram_arbiter.clients.ray.mapping import Result, map_results
+from vram_arbiter.clients.ray.mapping import Result, SeedsFailed, map_results
 from vram_arbiter.clients.results import committed
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.testing.timeline import Timeline
@@ -178,6 +178,23 @@ def test_a_leased_task_ends_with_its_lease(boxes: Boxes) -> None:
     granted = [one for box in boxes.nodes for one in Timeline(box.daemon).events("granted")]
     consumers = {one["consumer"] for one in granted}
     assert {f"job-{pid}" for pid in pids} <= consumers
+
+
+def test_seeds_without_a_result_are_named(boxes: Boxes, tmp_path: Path) -> None:
+    results: list[Result] = []
+    with Fleet() as fleet:
+        played = fleet.map(
+            fleet.spread(Fragile), "episode", range(6), out=tmp_path, deadline_s=60.0,
+            on_result=results.append,
+        )  # fmt: skip
+        with pytest.raises(SeedsFailed, match="3 seeds have no result") as failed:
+            list(played)
+    assert sorted(result.seed for result in results) == [0, 4, 5]
+    told = failed.value.details["failed"]
+    assert told["1"] == "ValueError: no such scene"
+    assert told["2"].startswith("Actor")
+    assert told["2"].endswith("(3 times)")
+    assert told["3"].startswith("TypeError: ")
 
 
 def test_a_node_and_its_arbiter_are_killed(

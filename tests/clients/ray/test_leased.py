@@ -18,7 +18,7 @@ from vram_arbiter.clients.ray import Refused, idempotent, leased
 from vram_arbiter.clients.ray.leased import refuse_resources
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.defaults import GIB
-from vram_arbiter.schemas.errors import BadRequest, LeaseRevoking
+from vram_arbiter.schemas.errors import BadRequest, LeaseRevoking, WaitTimeout
 from vram_arbiter.testing.gpu import FakeGpu
 from vram_arbiter.testing.timeline import Timeline
 
@@ -116,6 +116,24 @@ def test_evicted_between_calls_and_never_inside(make: Make, client: Client, spec
     assert model.nested(1) == 2
     again.join()
     assert model.loads == 2
+
+
+@pytest.mark.e2e
+def test_a_revoke_that_is_withdrawn_keeps_the_model(make: Make, client: Client, spec: Spec) -> None:
+    """A call that waited for the end of the lease never began."""
+    model = make()
+    with ThreadPoolExecutor(3) as pool:
+        inside = pool.submit(model.wait)
+        assert model.begun.wait(PATIENCE_S)
+        waiting = pool.submit(client.acquire, spec("other", 5), 3.0)
+        until(lambda: model.lease.revoking)
+        beside = pool.submit(model.act, 7)
+        with pytest.raises(WaitTimeout):
+            waiting.result(PATIENCE_S)
+        assert beside.result(PATIENCE_S) == 7
+        model.go.set()
+        assert inside.result(PATIENCE_S) == "held"
+    assert (model.loads, model.unloads) == (1, 0)
 
 
 @pytest.mark.e2e
