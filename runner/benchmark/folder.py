@@ -9,7 +9,7 @@ import argparse
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,6 +21,8 @@ from vram_arbiter.schemas.plain import JsonMap, JsonObject
 
 RUN = "run.json"
 RESULTS = "results"
+NUMBERS = ("task", "seed", "episodes", "max_steps", "latency_steps", "real_time")
+"""Flags that results follow from, as they are."""
 
 
 def flags_of(args: argparse.Namespace, entries: Sequence[Entry]) -> JsonObject:
@@ -30,14 +32,8 @@ def flags_of(args: argparse.Namespace, entries: Sequence[Entry]) -> JsonObject:
         "--skill": {name: revisions[name] for name in args.skill},
         "--policy": {name: _digest(Path(name.partition(":")[2])) for name in args.policy},
         "--scene": {str(scene): _digest(scene) for scene in args.scene},
-        "--task": args.task,
-        "--seed": args.seed,
-        "--episodes": args.episodes,
-        "--max-steps": args.max_steps,
-        "--latency-steps": args.latency_steps,
-        "--real-time": args.real_time,
         "--record": args.record and str(args.record),
-    }
+    } | {f"--{name.replace('_', '-')}": getattr(args, name) for name in NUMBERS}
 
 
 def claim(out: Path, flags: JsonMap) -> None:
@@ -61,18 +57,19 @@ def claim(out: Path, flags: JsonMap) -> None:
         raise ConfigError(f"{path} cannot be written: {error}") from error
 
 
-def take_up(out: Path, cell: Cell) -> Path:
-    """Give a cell what was played before, and return the folder of its results.
-
-    Results without a verdict are removed: their seeds are played again.
-    """
-    folder = out / RESULTS / cell.name
-    read(folder, cell)
+def take_up(out: Path, cell: Cell, seeds: Iterable[int]) -> list[int]:
+    """Return the seeds that are left to play. Results without a verdict are removed."""
+    read(out, cell)
     for played in cell.episodes:
         if played.success is None:
-            (folder / f"{played.seed:05d}.json").unlink()
-    cell.episodes = [played for played in cell.episodes if played.success is not None]
-    return folder
+            (results(out, cell) / f"{played.seed:05d}.json").unlink()
+    judged = {played.seed for played in cell.episodes if played.success is not None}
+    return [seed for seed in seeds if seed not in judged]
+
+
+def results(out: Path, cell: Cell) -> Path:
+    """Return the folder of a cell's results."""
+    return out / RESULTS / cell.name
 
 
 def keep(folder: Path, played: SeedOutcome) -> None:
@@ -83,8 +80,9 @@ def keep(folder: Path, played: SeedOutcome) -> None:
         raise ConfigError(f"{folder} cannot be written: {error}") from error
 
 
-def read(folder: Path, cell: Cell) -> None:
-    """Give a cell the results of its folder, in the order of seeds. Raises ConfigError."""
+def read(out: Path, cell: Cell) -> None:
+    """Give a cell its results, in the order of seeds. Raises ConfigError."""
+    folder = results(out, cell)
     try:
         cell.episodes = [SeedOutcome(**told) for told in committed(folder).values()]
     except TypeError as error:
@@ -105,16 +103,13 @@ def _compare(path: Path, flags: JsonMap) -> None:
         raise ConfigError(f"{path} does not describe a run: {error}") from None
     if differing:
         told = "; ".join(
-            f"{name} {_said(earlier, name)}, not {_said(flags, name)}" for name in differing
+            f"{name} {json.dumps(earlier.get(name))}, not {json.dumps(flags[name])}"
+            for name in differing
         )
         raise ConfigError(
             f"{path.parent} has results of another run: {told}",
             hint="name another --out, or remove that folder",
         )
-
-
-def _said(flags: JsonMap, name: str) -> str:
-    return json.dumps(flags.get(name))
 
 
 def _digest(path: Path) -> str | None:

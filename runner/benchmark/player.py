@@ -23,7 +23,7 @@ from vram_arbiter.runner.protocols import Goal, GoalParams, Skill, SkillEnded
 from vram_arbiter.runner.sim.config import CONTROL_HZ
 from vram_arbiter.runner.sim.robot import VIDEO_EVERY, SimRunner
 from vram_arbiter.runner.sim.video import VideoRecorder
-from vram_arbiter.schemas.errors import Cancelled, LimitExceeded, ModelError, VramError
+from vram_arbiter.schemas.errors import LimitExceeded, ModelError, VramError
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
@@ -56,13 +56,7 @@ class Player:
         self._world, self._told = world, told
         self._videos = videos
         self._episode_s = episode_s
-        self._stopping = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="player")
-
-    def stop(self) -> None:
-        """Event loop: end after the present tick; its episode does not count."""
-        self._stopping.set()
-        self.runner.request_stop()
 
     async def __aenter__(self) -> Self:
         """Raises what the runner's start raises; later errors are an episode's."""
@@ -78,7 +72,6 @@ class Player:
             self._thread.shutdown()
 
     async def play(self, seed: int) -> SeedOutcome:
-        """Raises Cancelled where it is stopped before the end."""
         began_s, name = time.monotonic(), self._skill.key.rskill_id
         recorder = self._recorder_of(seed)
         try:
@@ -91,12 +84,10 @@ class Player:
                 )
                 self.runner.caption = tuple(filter(None, (f"{name}, seed {seed}", prompt)))
                 try:
-                    await self._unless_stopped(self._skill.start(goal))
+                    await self._skill.start(goal)
                     played = await self._on_thread(lambda: self._episode(goal, seed, recorder))
                 finally:
                     await _quietly(self._skill.finish())
-        except Cancelled:
-            raise
         except VramError as error:
             played = SeedOutcome(seed, None, error=error.code, message=str(error))
         finally:
@@ -117,7 +108,7 @@ class Player:
         return self._told()
 
     def _episode(self, goal: Goal, seed: int, recorder: VideoRecorder | None) -> SeedOutcome:
-        """Tick until the episode is over. Raises Cancelled when the player is stopped."""
+        """Tick until the episode is over."""
         runner, robot, ended = self.runner, self.runner.robot, list[SkillEnded]()
         robot.video.recorder = recorder
         number, ends_s = robot.episode_idx, time.monotonic() + self._episode_s
@@ -126,8 +117,11 @@ class Player:
         with runner.paced() as wait:
             try:
                 while robot.episode_idx == number:  # a skill that ends, ends the episode
-                    if self._stopping.is_set() or time.monotonic() > ends_s:
-                        raise self._cut_off()
+                    if time.monotonic() > ends_s:
+                        raise LimitExceeded(
+                            f"the episode is not over after {self._episode_s:.0f} s",
+                            details={"limit": "episode_seconds"},
+                        )
                     tick = runner.tick()
                     steps += 1
                     wait()
@@ -147,28 +141,9 @@ class Player:
             message=str(error) if error is not None else "",
         )
 
-    def _cut_off(self) -> VramError:
-        if self._stopping.is_set():
-            return Cancelled("the player is to stop")
-        problem = f"the episode is not over after {self._episode_s:.0f} s"
-        return LimitExceeded(problem, details={"limit": "episode_seconds"})
-
     # -- helpers
     async def _on_thread[T](self, work: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._thread, work)
-
-    async def _unless_stopped(self, work: Any) -> None:
-        """Await, but raise Cancelled when the player is stopped meanwhile."""
-        task, stopping = asyncio.ensure_future(work), asyncio.ensure_future(self._stopping.wait())
-        try:
-            await asyncio.wait([task, stopping], return_when=asyncio.FIRST_COMPLETED)
-            if not task.done():
-                raise Cancelled("the player is to stop")
-            task.result()
-        finally:
-            for one in (task, stopping):
-                one.cancel()
-            await asyncio.gather(task, stopping, return_exceptions=True)
 
     # -- video
     def _recorder_of(self, seed: int) -> VideoRecorder | None:

@@ -14,6 +14,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
 
@@ -49,7 +50,7 @@ class Processes:
         """End `play` soon; episodes in progress do not count."""
         self._stopping = True
         for worker in self._workers:
-            worker.no_more()
+            worker.process.kill()
 
     async def play(self, cell: int, seeds: Sequence[int], folder: Path, tell: Tell) -> None:
         """Play seeds of the cell of this number, and commit their outcomes to the folder.
@@ -99,16 +100,13 @@ class _Lost(Exception):
     """A worker died or was late, and is dead now."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class _Worker:
     """One process."""
 
-    def __init__(
-        self,
-        process: subprocess.Popen[bytes],
-        reader: asyncio.StreamReader,
-        writer: asyncio.StreamWriter,
-    ) -> None:
-        self._process, self._reader, self._writer = process, reader, writer
+    process: subprocess.Popen[bytes]
+    reader: asyncio.StreamReader
+    writer: asyncio.StreamWriter
 
     @classmethod
     async def start(cls, command: Sequence[str]) -> Self:
@@ -119,10 +117,10 @@ class _Worker:
 
     async def play(self, seed: int, deadline_s: float) -> JsonObject:
         """Return the outcome of a seed. Raises _Lost, and what keeps the cell from being played."""
-        self._writer.write(b"%d\n" % seed)
+        self.writer.write(b"%d\n" % seed)
         try:
             async with asyncio.timeout(deadline_s):
-                answer = _read(await self._reader.readline())
+                answer = _read(await self.reader.readline())
         except TimeoutError:
             await self.kill()
             raise _Lost(f"no answer within {deadline_s:g} s") from None
@@ -132,25 +130,19 @@ class _Worker:
             raise _Lost(f"its worker ended with {await self.kill()}")
         return answer
 
-    def no_more(self) -> None:
-        """End the episode in progress, and the worker behind it."""
-        with contextlib.suppress(OSError):
-            self._writer.write_eof()
-
     async def end(self) -> None:
-        """Wait for its orderly end. Raises the error of its recording."""
-        self.no_more()
-        with contextlib.suppress(TimeoutError):
+        """Let it end in order. Raises the error of its recording."""
+        with contextlib.suppress(OSError, TimeoutError):
+            self.writer.write_eof()
             async with asyncio.timeout(LEAVE_S):
-                for line in (await self._reader.read()).splitlines(keepends=True):
-                    _read(line)
-                await asyncio.to_thread(self._process.wait)
+                _read(await self.reader.readline())
+                await asyncio.to_thread(self.process.wait)
 
     async def kill(self) -> int:
         """Kill it where it still runs; return its exit code."""
-        self._process.kill()
-        self._writer.close()
-        return await asyncio.to_thread(self._process.wait)
+        self.process.kill()
+        self.writer.close()
+        return await asyncio.to_thread(self.process.wait)
 
 
 def _spawn(command: Sequence[str], descriptor: int) -> subprocess.Popen[bytes]:

@@ -8,6 +8,7 @@ import logging
 import sys
 import time
 from collections.abc import Callable
+from datetime import timedelta
 from typing import Final
 
 from vram_arbiter.runner.benchmark.outcomes import Cell, SeedOutcome
@@ -42,16 +43,6 @@ class Progress:
 
     def __str__(self) -> str:
         per_s = self._played / max(self._clock() - self._began_s, 1e-9)
-        left = (
-            ""
-            if not self._played
-            else f", {_duration((self._episodes - self._played) / per_s)} left"
-        )
+        left = timedelta(seconds=round((self._episodes - self._played) / per_s))
         errors = f", {self._errors} errors" if self._errors else ""
-        return f"{self._played}/{self._episodes}, {60 * per_s:.3g} a minute{left}{errors}"
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest_s = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest_s:02d}"
+        return f"{self._played}/{self._episodes}, {60 * per_s:.3g} a minute, {left} left{errors}"

@@ -1,7 +1,7 @@
 """A worker: plays the seeds of one cell that its parent names, in a process of its own.
 
 The parent is `runner.benchmark.processes`: a seed a line in, an outcome or an error a line out, as
-JSON on one socket. A parent that has ended, or says no more, ends the episode in progress.
+JSON on one socket, until the parent says no more. A worker whose parent dies ends at once.
 """
 
 from __future__ import annotations
@@ -9,26 +9,26 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import os
 import signal
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import asdict, replace
 from json import dumps
-from typing import TYPE_CHECKING
 
 from vram_arbiter.runner.benchmark.entries import entries_of, player_of
 from vram_arbiter.runner.cli.common import connect_arbiter, lease_rendering, warm_up
 from vram_arbiter.runner.cli.recording import conclude_recording, record_sim
-from vram_arbiter.schemas.errors import Cancelled, VramError
-from vram_arbiter.schemas.plain import JsonMap, JsonObject
+from vram_arbiter.schemas.errors import VramError
+from vram_arbiter.schemas.plain import JsonObject
 
-if TYPE_CHECKING:
-    from vram_arbiter.runner.benchmark.player import Player
+Play = Callable[[int], Awaitable[JsonObject]]
+"""Plays a seed and returns its outcome as it is committed. Raises what the recording lost."""
 
 
 @contextlib.asynccontextmanager
-async def working(args: argparse.Namespace, cell: int) -> AsyncIterator[Player]:
-    """Open the player of the cell of this number. Raises the first error of its recording."""
+async def working(args: argparse.Namespace, cell: int) -> AsyncIterator[Play]:
+    """Open the player of the cell of this number. Raises where it cannot be played at all."""
     async with contextlib.AsyncExitStack() as stack:
         arbiter = None
         if args.skill and not args.no_arbiter:
@@ -37,19 +37,19 @@ async def working(args: argparse.Namespace, cell: int) -> AsyncIterator[Player]:
         await asyncio.to_thread(warm_up)
         player = player_of(entries_of(args, arbiter)[cell], args)
         dataset = await record_sim(
-            args, player.runner, player.runner.rate_hz, player.stop, stack,
+            args, player.runner, player.runner.rate_hz, lambda: None, stack,
             robot="so101-mobile", strict=True,
         )  # fmt: skip
+
+        async def play(seed: int) -> JsonObject:
+            played = await player.play(seed)
+            if dataset is not None and dataset.counts.error is not None:
+                raise dataset.counts.error  # it was played for the recording
+            return asdict(replace(played, node=socket.gethostname()))
+
         async with player:
-            yield player
-    if dataset is not None and dataset.counts.error is not None:
-        raise dataset.counts.error  # it was played for the recording
+            yield play
     await conclude_recording(dataset)
-
-
-async def play(player: Player, seed: int) -> JsonObject:
-    """Return a seed's outcome as it is committed. Raises Cancelled."""
-    return asdict(replace(await player.play(seed), node=socket.gethostname()))
 
 
 async def serve(args: argparse.Namespace) -> int:
@@ -57,32 +57,21 @@ async def serve(args: argparse.Namespace) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's goes to the parent, too
     cell, descriptor = args.worker
     reader, writer = await asyncio.open_unix_connection(sock=socket.socket(fileno=descriptor))
-
-    def say(answer: JsonMap) -> None:
-        writer.write(dumps(answer).encode() + b"\n")
-
     try:
-        async with working(args, cell) as player:
-            seeds = asyncio.Queue[int | None]()
-            listening = asyncio.create_task(_listen(reader, player, seeds))
-            with contextlib.suppress(Cancelled):
-                while (seed := await seeds.get()) is not None:
-                    say(await play(player, seed))
-            listening.cancel()
+        async with working(args, cell) as play:
+            order = asyncio.create_task(reader.readline())
+            while seed := await order:
+                order = asyncio.create_task(reader.readline())
+                playing = asyncio.ensure_future(play(int(seed)))
+                await asyncio.wait([order, playing], return_when=asyncio.FIRST_COMPLETED)
+                if not playing.done():
+                    os._exit(1)  # its parent died
+                writer.write(dumps(await playing).encode() + b"\n")
         return 0
     except VramError as error:
-        say({"raised": error.to_wire()})
+        writer.write(dumps({"raised": error.to_wire()}).encode() + b"\n")
         return 1
     finally:
-        with contextlib.suppress(ConnectionError):  # the parent has ended
+        with contextlib.suppress(ConnectionError):  # its parent died
             writer.close()
             await writer.wait_closed()
-
-
-async def _listen(
-    reader: asyncio.StreamReader, player: Player, seeds: asyncio.Queue[int | None]
-) -> None:
-    while line := await reader.readline():
-        seeds.put_nowait(int(line))
-    player.stop()
-    seeds.put_nowait(None)

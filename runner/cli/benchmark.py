@@ -9,9 +9,10 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.benchmark import folder
@@ -32,24 +33,13 @@ from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.printable import printable_lines
 
+if TYPE_CHECKING:
+    from vram_arbiter.runner.benchmark.processes import Processes
+
+    Players = Processes
+
 HUNG_S = 300.0
 """Beyond `--episode-seconds`, after which a worker is killed: its model loads meanwhile."""
-
-
-class Players(Protocol):
-    """What plays seeds somewhere. `play` commits each outcome to the folder, then calls `tell`;
-    `stop` ends it early.
-    """
-
-    async def play(
-        self,
-        cell: int,
-        seeds: Sequence[int],
-        folder: Path,
-        tell: Callable[[SeedOutcome], None],
-    ) -> None: ...
-
-    def stop(self) -> None: ...
 
 
 def add_parser(commands: Commands) -> argparse.ArgumentParser:
@@ -176,49 +166,32 @@ async def _play(
 ) -> list[Cell]:
     """Play what is missing of every cell; return all, with what was played before."""
     cells = [entry.cell() for entry in entries]
-    folders = [folder.take_up(args.out, cell) for cell in cells]
-    progress = Progress(args.episodes * len(cells) - sum(len(cell.episodes) for cell in cells))
+    seeds = range(args.seed, args.seed + args.episodes)
+    missing = [folder.take_up(args.out, cell, seeds) for cell in cells]
+    progress = Progress(sum(map(len, missing)))
 
     async def forward() -> None:
         await stopping.wait()
         players.stop()
 
-    forwarding = asyncio.create_task(forward())
-    try:
-        for number, (cell, results) in enumerate(zip(cells, folders, strict=True)):
-            if stopping.is_set():
-                cell.why = "stopped"
-                continue
-            await _play_cell(args, number, cell, results, players, progress)
-            write_report(args, cells, complete=False)
-    finally:
-        progress.end()
-        forwarding.cancel()
-        await asyncio.gather(forwarding, return_exceptions=True)
-    return cells
-
-
-async def _play_cell(
-    args: argparse.Namespace,
-    number: int,
-    cell: Cell,
-    results: Path,
-    players: Players,
-    progress: Progress,
-) -> None:
-    done = {played.seed for played in cell.episodes}
-    seeds = [one for one in range(args.seed, args.seed + args.episodes) if one not in done]
-    ended: list[SeedOutcome] = []
-
-    def tell(played: SeedOutcome) -> None:
+    def tell(cell: Cell, ended: list[SeedOutcome], played: SeedOutcome) -> None:
         ended.append(played)
         progress.tell(cell, played)
         cell.why = cell.why or given_up(ended)
         if cell.why:
             players.stop()
 
-    if seeds:
-        await players.play(number, seeds, results, tell)
-    folder.read(results, cell)
-    cell.complete = len(cell.episodes) == args.episodes
-    cell.why = "" if cell.complete else cell.why or "stopped"
+    forwarding = asyncio.create_task(forward())
+    try:
+        for number, (cell, left) in enumerate(zip(cells, missing, strict=True)):
+            if left and not stopping.is_set():
+                told = functools.partial(tell, cell, [])
+                await players.play(number, left, folder.results(args.out, cell), told)
+            folder.read(args.out, cell)
+            cell.complete = len(cell.episodes) == args.episodes
+            cell.why = "" if cell.complete else cell.why or "stopped"
+            write_report(args, cells, complete=False)
+    finally:
+        progress.end()
+        forwarding.cancel()
+    return cells

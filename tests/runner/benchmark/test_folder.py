@@ -30,7 +30,9 @@ def test_a_folder_with_results_is_of_one_runs_flags(tmp_path: Path) -> None:
     commit(tmp_path / folder.RESULTS / cell().name, 0, {})
     folder.claim(tmp_path, flags)
     others = folder.flags_of(args(episodes=20, seed=5), [])
-    with pytest.raises(ConfigError, match="results of another run: --seed 0, not 5; --episodes 10"):
+    with pytest.raises(
+        ConfigError, match="results of another run: --seed 0, not 5; --episodes 10, not 20"
+    ):
         folder.claim(tmp_path, others)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["results", "run.json"]
 
@@ -60,19 +62,17 @@ def test_a_changed_scene_or_script_is_another_run(tmp_path: Path) -> None:
 
 
 def test_what_has_no_verdict_is_played_again(tmp_path: Path) -> None:
-    results = folder.take_up(tmp_path, cell())
+    one = cell()
     for played in (SeedOutcome(7, True), unplayed(8, "no sidecar"), SeedOutcome(9, False)):
-        folder.keep(results, played)
-    folder.keep(results, SeedOutcome(9, True))  # it has a result already
-    again = cell()
-    folder.take_up(tmp_path, again)
-    assert [(one.seed, one.success) for one in again.episodes] == [(7, True), (9, False)]
-    folder.keep(results, SeedOutcome(8, True))
-    folder.read(results, again)
-    assert [one.seed for one in again.episodes] == [7, 8, 9]
+        folder.keep(folder.results(tmp_path, one), played)
+    folder.keep(folder.results(tmp_path, one), SeedOutcome(9, True))  # it has a result already
+    assert folder.take_up(tmp_path, one, range(7, 11)) == [8, 10]
+    folder.keep(folder.results(tmp_path, one), SeedOutcome(8, True))
+    folder.read(tmp_path, one)
+    assert [(e.seed, e.success) for e in one.episodes] == [(7, True), (8, True), (9, False)]
 
 
 def test_a_result_of_something_else_is_named(tmp_path: Path) -> None:
-    commit(tmp_path / folder.RESULTS / cell().name, 1, {"color": "red"})
+    commit(folder.results(tmp_path, cell()), 1, {"color": "red"})
     with pytest.raises(ConfigError, match="results of another version"):
-        folder.take_up(tmp_path, cell())
+        folder.take_up(tmp_path, cell(), [])

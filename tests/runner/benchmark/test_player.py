@@ -1,7 +1,5 @@
 """Episodes of one contestant: one reset a seed, errors that are no verdicts, and their end."""
 
-import asyncio
-import contextlib
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +14,7 @@ from vram_arbiter.runner.benchmark.player import Player
 from vram_arbiter.runner.protocols import ChunkStart, Hold
 from vram_arbiter.runner.sim.policies import PolicySkill, policy_of
 from vram_arbiter.runner.sim.robot import sim_runner
-from vram_arbiter.schemas.errors import Cancelled, SidecarUnavailable
+from vram_arbiter.schemas.errors import SidecarUnavailable
 from vram_arbiter.schemas.runtime.telemetry import spans as tracing
 
 LOST = f"scripted:{Path(__file__).parents[1]}/lost.py"
@@ -125,33 +123,6 @@ def test_a_sidecar_that_is_not_there_is_no_verdict(run_async: Run) -> None:
     episodes = run_async(one.play(absent, (1, 2)))
     assert [e.error for e in episodes] == ["sidecar_unavailable"] * 2
     assert absent.released == 1
-
-
-def test_an_episode_that_is_stopped_does_not_count(run_async: Run) -> None:
-    one = Played()
-
-    async def scenario() -> list[int]:
-        loop, seen = asyncio.get_running_loop(), list[int]()
-
-        def make(env: Any, seed: int) -> Any:
-            def act(world: Any) -> Any:
-                if seed == 2:
-                    asyncio.run_coroutine_threadsafe(stop(), loop).result()
-                return dict(env.sent())
-
-            return act
-
-        async def stop() -> None:
-            player.stop()
-
-        async with one.player(PolicySkill("p", make, one.world)) as player:
-            with contextlib.suppress(Cancelled):
-                for seed in range(100):
-                    seen.append((await player.play(seed)).seed)
-        return seen
-
-    assert run_async(scenario()) == [0, 1]
-    assert one.env.resets == [0, 1, 2]
 
 
 def test_a_contestant_that_never_acts_does_not_play_for_ever(run_async: Run) -> None:
