@@ -73,6 +73,7 @@ COMMANDS: Mapping[str, Command] = {
     "selftest": Command("selftest", "prove on this machine's GPU what the product claims of it"),
     "install": Command("install", "make the arbiter a service, after showing the plan"),
     "uninstall": Command("install", "remove what `vramctl install` put on this machine"),
+    "fleet": Command("fleet", "see the boxes of a Ray cluster, and where a model would go"),
     "mcp": Command("mcp", "serve status, why and history to agents"),
     "replay": Command("offline", "replay a recorded event log", passes_on=True),
     "demo": Command("demo", "run find, navigate and grab on a simulated arm in 8 GiB"),

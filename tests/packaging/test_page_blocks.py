@@ -241,6 +241,8 @@ KINDS: Mapping[frozenset[str], Callable[[str], object]] = {
     frozenset({"keys"}): lambda text: load_keys(text, "page"),
     frozenset({"services"}): yaml.safe_load,  # compose
     frozenset({"scrape_configs"}): yaml.safe_load,  # Prometheus
+    frozenset({"workerGroupSpecs"}): yaml.safe_load,  # KubeRay
+    frozenset({"spec"}): yaml.safe_load,  # Kubernetes
 }
 """How a block is checked that has these keys: the first row of which it has all."""
 

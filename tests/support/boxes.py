@@ -11,6 +11,7 @@ seconds, and a test file is collected without it.
 
 import contextlib
 import os
+import secrets
 import signal
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
@@ -35,6 +36,9 @@ VARIABLES: Final = {
     # workers that are started for drivers yet to come cost each node seconds of a core
     "RAY_enable_worker_prestart": "0",
     "RAY_prestart_worker_first_driver": "0",
+    # Ray listens on all addresses
+    "RAY_AUTH_MODE": "token",
+    "RAY_AUTH_TOKEN": secrets.token_hex(32),
 }
 
 
@@ -92,8 +96,10 @@ class Boxes:
     def __enter__(self) -> Self:
         with self._undo:  # what has begun ends, if the rest fails
             self._undo.enter_context(_variables(self._environ))
+            from ray._private.authentication_test_utils import reset_auth_token_state
             from ray.cluster_utils import Cluster
 
+            reset_auth_token_state()  # Ray reads these variables when it is imported
             self._cluster = Cluster()
             self._undo.callback(self._shutdown)
             for number in range(self._count):
