@@ -9,7 +9,7 @@ import argparse
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -23,6 +23,9 @@ RUN = "run.json"
 RESULTS = "results"
 NUMBERS = ("task", "seed", "episodes", "max_steps", "latency_steps", "real_time")
 """Flags that results follow from, as they are."""
+
+Tell = Callable[[SeedOutcome], None]
+"""Called with each outcome once it is committed."""
 
 
 def flags_of(args: argparse.Namespace, entries: Sequence[Entry]) -> JsonObject:

@@ -13,14 +13,14 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
 
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.ray.mapping import Seeds
-from vram_arbiter.runner.benchmark.folder import keep
+from vram_arbiter.runner.benchmark.folder import Tell, keep
 from vram_arbiter.runner.benchmark.outcomes import SeedOutcome, unplayed
 from vram_arbiter.schemas.errors import from_wire
 from vram_arbiter.schemas.plain import JsonObject
@@ -29,9 +29,6 @@ LINE_MAX_BYTES: Final = 1 << 20
 LEAVE_S: Final = 300.0
 """To the end of a worker that has no more to do: a recording is finished meanwhile."""
 STDERR: Final = 2
-
-Tell = Callable[[SeedOutcome], None]
-"""Called with each outcome once it is committed."""
 
 
 class Processes:

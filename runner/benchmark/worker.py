@@ -12,9 +12,10 @@ import contextlib
 import os
 import signal
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from dataclasses import asdict, replace
 from json import dumps
+from typing import Any
 
 from vram_arbiter.runner.benchmark.entries import entries_of, player_of
 from vram_arbiter.runner.cli.common import connect_arbiter, lease_rendering, warm_up
@@ -22,7 +23,7 @@ from vram_arbiter.runner.cli.recording import conclude_recording, record_sim
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.plain import JsonObject
 
-Play = Callable[[int], Awaitable[JsonObject]]
+Play = Callable[[int], Coroutine[Any, Any, JsonObject]]
 """Plays a seed and returns its outcome as it is committed. Raises what the recording lost."""
 
 
@@ -62,7 +63,7 @@ async def serve(args: argparse.Namespace) -> int:
             order = asyncio.create_task(reader.readline())
             while seed := await order:
                 order = asyncio.create_task(reader.readline())
-                playing = asyncio.ensure_future(play(int(seed)))
+                playing = asyncio.create_task(play(int(seed)))
                 await asyncio.wait([order, playing], return_when=asyncio.FIRST_COMPLETED)
                 if not playing.done():
                     os._exit(1)  # its parent died

@@ -34,9 +34,10 @@ from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.runtime.printable import printable_lines
 
 if TYPE_CHECKING:
+    from vram_arbiter.runner.benchmark.boxes import Boxes
     from vram_arbiter.runner.benchmark.processes import Processes
 
-    Players = Processes
+    Players = Boxes | Processes
 
 HUNG_S = 300.0
 """Beyond `--episode-seconds`, after which a worker is killed: its model loads meanwhile."""
@@ -93,7 +94,12 @@ def add_parser(commands: Commands) -> argparse.ArgumentParser:
     )  # fmt: skip
     bench.add_argument(
         "--workers", type=positive_int, default=1, metavar="N",
-        help="processes that play at the same time; default 1",
+        help="processes that play at the same time, with --ray on each box; default 1",
+    )  # fmt: skip
+    bench.add_argument(
+        "--ray", metavar="ADDRESS",
+        help="play on the boxes of this Ray cluster (HOST:PORT, or auto), each with its own arbiter"
+        " and sidecars",
     )  # fmt: skip
     bench.add_argument("--worker", type=int, nargs=2, help=argparse.SUPPRESS)  # cell, descriptor
     bench.add_argument("--videos", action=argparse.BooleanOptionalAction, default=True)
@@ -139,8 +145,13 @@ def _checked(args: argparse.Namespace) -> list[Entry]:
             hint="words after -- are for lerobot-eval: name an environment of lerobot by --env",
         )
     entries = entries_of(args, None)
-    if args.record is not None and (len(entries) > 1 or args.workers > 1):
-        raise ConfigError("--record takes one contestant in one scene, and one worker")
+    if args.record is not None and (len(entries) > 1 or args.workers > 1 or args.ray):
+        raise ConfigError("--record takes one contestant in one scene, and one local worker")
+    if args.ray and args.workers > 1 and not all("=" in flag for flag in args.sidecar):
+        raise ConfigError(
+            "--ray with several workers a box does not start the sidecar that they share",
+            hint="start it on each box, and name its endpoint: --sidecar RSKILL=ENDPOINT",
+        )
     check_output("--out", args.out / REPORT)
     if args.videos:
         check_output("--out", args.out / VIDEOS / "any")
@@ -150,8 +161,14 @@ def _checked(args: argparse.Namespace) -> list[Entry]:
 
 
 async def _players(args: argparse.Namespace, stack: contextlib.AsyncExitStack) -> Players:
-    """Return who plays, and start the sidecars of this machine where it does."""
+    """Return what plays; without Ray, with the sidecars of this machine."""
     deadline_s = args.episode_seconds + HUNG_S
+    if args.ray:
+        from vram_arbiter.clients.ray.fleet import connected
+        from vram_arbiter.runner.benchmark.boxes import Boxes
+
+        fleet = stack.enter_context(connected(args.ray))
+        return Boxes(fleet, args.argv, args.workers, deadline_s)
     from vram_arbiter.runner.benchmark.processes import Processes
 
     if args.skill and not args.no_arbiter:

@@ -79,9 +79,9 @@ def _checked(args: argparse.Namespace) -> str:
             f"--env {args.env} plays the checkpoints of skills: give --skill, and neither --policy,"
             " --task, --scene nor --record"
         )
-    if args.workers > 1:
+    if args.workers > 1 or args.ray:
         raise ConfigError(
-            f"--env {args.env} is played by one {PROGRAM}: leave --workers out",
+            f"--env {args.env} is played by one {PROGRAM}: give neither --workers nor --ray",
             hint="-- --eval.batch_size=10 plays ten episodes at the same time",
         )
     if args.max_steps != MAX_STEPS or args.latency_steps is not None or args.real_time:
