@@ -31,7 +31,7 @@ BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help setup setup-core setup-worlds setup-vllm jetson demo test test-core test-gpu nightly mutation fuzz measure lint format \
-	explore lock sbom wheel chaos sim bench bench-doors bench-gateway bench-switch schemas docs clean
+	explore lock sbom wheel chaos sim bench bench-doors bench-fleet bench-gateway bench-switch schemas docs clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -112,6 +112,9 @@ bench-gateway: setup ## what the gateway adds, and two servers in room for one: 
 
 bench-doors: setup ## how long robots at a sidecar's doors wait while one process attacks
 	$(TOOL) tests/bench/doors.py $(if $(QUICK),--quick) $(ARGS)
+
+bench-fleet: setup ## a lease's cost in an actor of Ray, scaling, a node's death: ARGS="--quick --only calls"
+	$(TOOL) tests/bench/fleet.py $(if $(QUICK),--quick) $(ARGS)
 
 schemas: setup ## write the JSON Schemas after a model changed
 	$(BIN)/python -m vram_arbiter.schemas export schemas/json

@@ -82,6 +82,9 @@ def parser() -> argparse.ArgumentParser:
         help="Unix group that may evict, pin and drain; without --group it may also connect",
     )
     made.add_argument(
+        "--guests-group", metavar="GROUP", help="Unix group of --group that may only use and look"
+    )
+    made.add_argument(
         "--http",
         metavar="ADDRESS:PORT",
         type=loopback,
@@ -135,6 +138,7 @@ def effective_config(flags: argparse.Namespace, file: Path | None) -> ArbiterCon
         ("state", "dir", flags.state_dir, "--state-dir"),
         ("wire", "group", flags.group, "--group"),
         ("wire", "operators_group", flags.operators_group, "--operators-group"),
+        ("wire", "guests_group", flags.guests_group, "--guests-group"),
         ("log", "format", flags.log_format, "--log-format"),
         ("log", "level", flags.log_level, "--log-level"),
     ):

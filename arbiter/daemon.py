@@ -65,6 +65,8 @@ EXIT_DEFECT = 70
 PROBE_START_S = 30.0
 """Without persistence mode the NVIDIA driver needs seconds to initialize its GPUs."""
 KEEP_LEARNT_EVERY_S = 10.0
+GUESTS_EVERY_S = 0.25
+"""How often guests are looked at for silence, where there may be any."""
 
 
 class Daemon:
@@ -120,6 +122,7 @@ class Daemon:
                 beat(notifier, self._inbox.pulse, self._chores(), self._status_line),
                 self._reload.serve(notifier, self._status_line),
                 self._keep_learnt_regularly(),
+                self._end_silent_guests(),
             ):
                 task = self._loop.create_task(serves)
                 task.add_done_callback(self._background_ended)
@@ -142,6 +145,7 @@ class Daemon:
         operators = group_id("wire.operators_group", config.wire.operators_group)
         members = group_id("wire.group", config.wire.group)
         group = operators if members is None else members  # of the socket: it has one
+        guests = group_id("wire.guests_group", config.wire.guests_group)
         limits = router_limits(config, raise_limits())
         self._locks = take_folders(places, config, self._environ, group, undo)  # 1
         boot = boot_id()
@@ -154,6 +158,7 @@ class Daemon:
             server=self._server,
             processes_max=limits.connections_max,
             operators_gid=operators,
+            guests_gid=guests,
             cgroup_root=cgroup_root(),
         )
         self._connect_parts(probe, sessions, undo)  # 3
@@ -329,6 +334,11 @@ class Daemon:
             await asyncio.sleep(KEEP_LEARNT_EVERY_S)
             if not self._inbox.closed:
                 self._keep_learnt()
+
+    async def _end_silent_guests(self) -> None:
+        while self._config.wire.guests_group is not None:
+            await asyncio.sleep(GUESTS_EVERY_S)
+            self._sessions.end_silent_guests()
 
     def _keep_learnt(self) -> None:
         """So that a kill loses no more than the last few seconds of learning."""

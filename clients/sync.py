@@ -94,7 +94,11 @@ class _Portal:
             RuntimeWarning,
             stacklevel=2,
         )
-        if not main_thread().is_alive():
+        self.abandon(connection)
+
+    def abandon(self, connection: AbstractContextManager[Any]) -> None:
+        """Leave, in whatever thread, or at the end of the program."""
+        if self.inherited or not main_thread().is_alive():
             return  # the program ends, and its leases with it: no handler could run any more
         try:
             asyncio.get_running_loop()

@@ -93,6 +93,11 @@ class LimitExceeded(CallerError, code="limit_exceeded"):
     it."""
 
 
+class RemoteMayNotHold(NotPermitted, code="remote_may_not_hold"):
+    """A guest asked for a lease: what needs the GPU runs on its machine, and holds the lease
+    there."""
+
+
 # -- leases
 class VramInsufficient(CallerError, code="vram_insufficient"):
     """It can never fit: `details.needed_bytes`, `capacity_bytes`, `reserve_bytes`."""

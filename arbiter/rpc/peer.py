@@ -1,4 +1,4 @@
-"""What a peer may be: visible, and perhaps an operator. Which process it is says the kernel
+"""What a peer may be: visible, and perhaps an operator or a guest. Which process it is says the kernel
 (`schemas.runtime.peercred`).
 
 Must not know sessions or requests.
@@ -6,7 +6,6 @@ Must not know sessions or requests.
 
 import grp
 import os
-import pwd
 from pathlib import Path
 
 from vram_arbiter.schemas.errors import ConfigError, NotPermitted
@@ -29,15 +28,15 @@ def is_operator(peer: Peer, operators_gid: int | None) -> bool:
     operators' group."""
     if peer.uid in (0, os.getuid()):
         return True
-    if operators_gid is None:
+    return operators_gid is not None and peer.belongs_to(operators_gid)
+
+
+def is_guest(peer: Peer, guests_gid: int | None) -> bool:
+    """A member of the guests' group, whatever else it belongs to; never root or the daemon's
+    user."""
+    if guests_gid is None or peer.uid in (0, os.getuid()):
         return False
-    if peer.gid == operators_gid:
-        return True
-    try:
-        account = pwd.getpwuid(peer.uid)
-    except KeyError:
-        return False
-    return operators_gid in os.getgrouplist(account.pw_name, account.pw_gid)
+    return peer.belongs_to(guests_gid)
 
 
 def check_cgroup(peer: Peer, cgroup: str, root: Path | None, operators_gid: int | None) -> None:

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Protocol
 
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.rpc.peer import check_visible, how_to_operate, is_operator
+from vram_arbiter.arbiter.rpc.peer import check_visible, how_to_operate, is_guest, is_operator
+from vram_arbiter.arbiter.rpc.roles import Role
 from vram_arbiter.schemas.errors import LimitExceeded, NotPermitted
 from vram_arbiter.schemas.ids import ClientId, ProcessKey
 from vram_arbiter.schemas.runtime.peercred import Peer
@@ -25,6 +26,10 @@ from vram_arbiter.schemas.wire.views import DemandView
 SILENT_S = 10.0
 """At a limit of sessions a connection that never held anything and has been silent for so long
 makes room."""
+GUEST_HEARTBEAT_S = 1.0
+GUEST_SILENT_BEATS = 4
+"""A guest that said nothing for so many heartbeats has no network: its uses end. sshd is not waited
+for: 9.2 takes 8 s for a nominal 4, and for ever while the server has something to send."""
 NEWCOMERS = 8
 """One in so many places is for processes that have no session yet."""
 
@@ -101,6 +106,7 @@ class SessionSettings:
     rate_per_process_per_s: int
     subscribers_max: int
     operators_gid: int | None
+    guests_gid: int | None = None
     cgroup_root: Path | None = None
     """Where the cgroup v2 hierarchy is mounted."""
 
@@ -112,7 +118,7 @@ class Session:
     client: ClientId
     connection: PeerConnection
     peer: Peer
-    role: w.Role
+    role: Role
     name: str
     instance: str
     heard_at: float
@@ -161,14 +167,9 @@ class Registry:
         """
         peer = connection.peer
         check_visible(peer)  # 1
-        if hello.role == "operator" and not is_operator(peer, self._settings.operators_gid):  # 2
-            raise NotPermitted(
-                "only the daemon's user, root and the operators' group may be operator",
-                hint=how_to_operate(self._settings.operators_gid),
-                details={"uid": peer.uid},
-            )
+        role = self.role_of(peer, hello)  # 2
         client = ClientId(f"c{connection.serial}")
-        session = Session(client, connection, peer, hello.role, hello.name, hello.instance, now)
+        session = Session(client, connection, peer, role, hello.name, hello.instance, now)
         if (peer.process, hello.instance) not in self._instances:
             self._make_room(session)  # 3
         self._begin_watch(session)  # 4
@@ -181,6 +182,19 @@ class Registry:
             ev.ClientConnected(client, peer.process, peer.uid, session.name, session.instance)
         )
         return session
+
+    def role_of(self, peer: Peer, hello: w.Hello) -> Role:
+        """Return the role that a hello gets: a guest is one whatever it asks for. Raises
+        NotPermitted."""
+        if is_guest(peer, self._settings.guests_gid):
+            return "guest"
+        if hello.role == "operator" and not is_operator(peer, self._settings.operators_gid):
+            raise NotPermitted(
+                "only the daemon's user, root and the operators' group may be operator",
+                hint=how_to_operate(self._settings.operators_gid),
+                details={"uid": peer.uid},
+            )
+        return hello.role
 
     def _make_room(self, session: Session) -> None:
         """A place within the shares of the process and the user, beside the operators' reserve and,
@@ -289,13 +303,32 @@ class Registry:
     def lost(self, client: ClientId) -> None:
         """A connection has ended. Its session ends with it, unless the engine knows the client: a
         holder keeps its lease and its uses until it reattaches, its ttl is over or its process
-        dies.
+        dies. A guest's process does not die with the robot's program, so its uses end at once.
         """
         if (session := self.sessions.get(client)) is not None:
             session.lost = True
             session.demands = ()
             self.subscribers.pop(client, None)
-            self._end_if_forgotten(session)
+            if session.role == "guest":
+                self.leave(session, "its connection was lost")
+            else:
+                self._end_if_forgotten(session)
+
+    def end_silent_guests(self, now: float) -> None:
+        """End the uses of guests that have said nothing for a few heartbeats. Their process is the
+        server's end of a tunnel: it may live on without a network, and without the robot's
+        program."""
+        limit_s = GUEST_SILENT_BEATS * self.heartbeat_s("guest")
+        for session in list(self.sessions.values()):
+            silent_s = now - session.heard_at
+            if session.role == "guest" and silent_s > limit_s and self._is_known(session):
+                session.connection.close("a guest that was silent in a use")
+                self.leave(session, f"it was silent for {silent_s:.1f} s")
+
+    def heartbeat_s(self, role: Role) -> float:
+        """Return how often a client of a role is asked to say that it is there."""
+        every_s = self._settings.heartbeat_s
+        return min(every_s, GUEST_HEARTBEAT_S) if role == "guest" else every_s
 
     def sweep(self) -> None:
         """End the sessions of lost connections whose clients have nothing left. Called now and

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.log import RefusalLog
-from vram_arbiter.arbiter.rpc import codec
+from vram_arbiter.arbiter.rpc import codec, roles
 from vram_arbiter.arbiter.rpc.peer import check_cgroup
 from vram_arbiter.arbiter.rpc.registry import (
     Decisions,
@@ -30,7 +30,6 @@ from vram_arbiter.schemas.errors import (
     BadState,
     LimitExceeded,
     MessageTooLarge,
-    NotPermitted,
     UnknownSession,
     VersionMismatch,
     VramError,
@@ -180,7 +179,7 @@ class SessionTable:
                 self._welcome(self._registry.open(connection, request, now), request_id)
                 return True
             session.heard_at = now
-            operator = _check_role(session, request)  # 4
+            roles.check(session.role, request)  # 4
             for spec in _specs(request):
                 if spec.cgroup is not None:
                     known = self._settings.cgroup_root, self._settings.operators_gid
@@ -191,7 +190,13 @@ class SessionTable:
             if not session.leased and isinstance(request, _HOLDING):
                 self._registry.holds(session)
             self._decisions.post(
-                ev.Asked(session.client, request_id, request, envelope.traceparent, operator)
+                ev.Asked(
+                    session.client,
+                    request_id,
+                    request,
+                    envelope.traceparent,
+                    _operator(session, request),
+                )
             )
         except codec.Undecodable as bad:
             self._refuse(connection, session, bad.request_id, bad.error.view())
@@ -208,6 +213,10 @@ class SessionTable:
         """End the sessions of lost connections whose clients have nothing left. Called now and
         then."""
         self._registry.sweep()
+
+    def end_silent_guests(self) -> None:
+        """End the uses of guests that are heard of no longer. Called several times a second."""
+        self._registry.end_silent_guests(self._clock())
 
     def process_died(self, process: ProcessKey) -> None:
         """The kernel said so: forget its sessions. The engine hears it from the watch."""
@@ -280,7 +289,7 @@ class SessionTable:
             boot_id=settings.boot_id,
             server=settings.server,
             role=session.role,
-            heartbeat_s=settings.heartbeat_s,
+            heartbeat_s=self._registry.heartbeat_s(session.role),
             grace_s=settings.fence_grace_s,
         )
         self.reply(session.client, re, welcome)
@@ -292,7 +301,8 @@ class SessionTable:
             case w.Hello():
                 _check_version(request)
                 known = (session.name, session.instance, session.role)
-                if (request.name, request.instance, request.role) != known:
+                role = self._registry.role_of(session.peer, request)
+                if (request.name, request.instance, role) != known:
                     raise BadState(
                         f"this connection already said hello as {session.name!r}",
                         hint="open another connection",
@@ -394,16 +404,10 @@ class SessionTable:
                 )
 
 
-def _check_role(session: Session, request: w.AnyRequest) -> str:
-    """Return the name of the operator of an action by hand; "" for any other request. Raises
-    NotPermitted."""
-    role, op = session.role, request.TAG[1]
-    if role == "observer" and not isinstance(request, w.Question):
-        raise NotPermitted(f"an observer may not {op}", hint="say hello as a client")
+def _operator(session: Session, request: w.AnyRequest) -> str:
+    """Return the name of the operator of an action by hand; "" for any other request."""
     if not isinstance(request, w.ByHand):
         return ""
-    if role != "operator":
-        raise NotPermitted(f"only an operator may {op}", hint="say hello as operator")
     # the peer by the kernel's word; the name is what the connection calls itself
     return f"{session.name} (uid {session.peer.uid}, pid {session.peer.process.pid})"
 

@@ -181,14 +181,15 @@ class Connection:
         ]
 
     # -- time --------------------------------------------------------------------------------------
-    def deadlines(self, expects_grants: bool) -> Iterator[float]:
-        """`expects_grants`: a grant may come, so its age has to be known, by pings."""
+    def deadlines(self, both_ways: bool) -> Iterator[float]:
+        """`both_ways`: the arbiter has to hear of the client too, or the age of what may come has
+        to be known: pushes alone do not tell, pings do."""
         for request in self._pending.values():
             yield request.deadline
         if self._phase_deadline is not None:
             yield self._phase_deadline
         if self.phase == "up":
-            yield self._silent_at() if self._pinged else self._ping_at(expects_grants)
+            yield self._silent_at() if self._pinged else self._ping_at(both_ways)
 
     def wait_ends_at(self, deadline: float | None) -> float:
         """Return when a wait ends here. While in contact, the arbiter ends it first."""
@@ -211,17 +212,17 @@ class Connection:
             self.contact_lost(f"the arbiter was silent for {now - self._heard_at:.1f} s")
         return self.phase == "up"
 
-    def ping_if_silent(self, now: float, expects_grants: bool) -> None:
-        if not self._pinged and now >= self._ping_at(expects_grants):
+    def ping_if_silent(self, now: float, both_ways: bool) -> None:
+        if not self._pinged and now >= self._ping_at(both_ways):
             self._pinged = True
             self.ask(w.Ping(), now, quiet=True)
 
     def _silent_at(self) -> float:
         return self._heard_at + SILENCE_BEATS * self.heartbeat_s
 
-    def _ping_at(self, expects_grants: bool) -> float:
-        """Ping after a silence; while a grant may come also beside pushes."""
-        since = min(self._heard_at, self.asked_at) if expects_grants else self._heard_at
+    def _ping_at(self, both_ways: bool) -> float:
+        """Ping after a silence; `both_ways` also beside pushes."""
+        since = min(self._heard_at, self.asked_at) if both_ways else self._heard_at
         return since + self.heartbeat_s
 
     # -- steps: greeting ---------------------------------------------------------------------------

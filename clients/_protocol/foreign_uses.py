@@ -17,6 +17,9 @@ class ForeignUses:
         self._connection = connection
         self._uses: dict[str, ForeignUseRecord] = {}
 
+    def __len__(self) -> int:
+        return len(self._uses)
+
     def begin(
         self,
         request: UseBegin,

@@ -59,7 +59,7 @@ class ClientProtocol:
     def next_deadline(self) -> float | None:
         """Return when `tick` is due at the latest."""
         ends = chain(
-            self.connection.deadlines(bool(self.waits.waiters or self.holdings.asleep)),
+            self.connection.deadlines(self._counts_on_contact()),
             self.waits.deadlines(),
             self.holdings.deadlines(),
         )
@@ -74,7 +74,11 @@ class ClientProtocol:
         self.holdings.end_overdue(now)
         if self.connection.stays_up(now):  # 3
             self.holdings.renew(now)  # 4
-            self.connection.ping_if_silent(now, bool(self.waits.waiters or self.holdings.asleep))
+            self.connection.ping_if_silent(now, self._counts_on_contact())
+
+    def _counts_on_contact(self) -> bool:
+        """Return whether a grant may come, or a use ends where the arbiter hears nothing."""
+        return bool(self.waits.waiters or self.holdings.asleep or self.foreign_uses)
 
     # -- for the connection (`clients._protocol.connection.Above`) ---------------------------------
     def reattachments(self) -> tuple[w.ReattachLease, ...]:

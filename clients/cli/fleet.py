@@ -6,9 +6,9 @@ import json
 import os
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from vram_arbiter.clients.cli import text
 from vram_arbiter.clients.cli.arguments import add_json, at_least, name, size
@@ -78,6 +78,16 @@ def run(args: argparse.Namespace) -> int:
         return _ACTIONS[args.action](fleet, args)
 
 
+def _named(fleet: "Fleet", key: str, answers: Mapping[str, object]) -> list[Message]:
+    """Return the answers with their boxes, in the order of names; None: unknown."""
+    names = fleet.boxes()
+    boxes = [
+        {"node": node, "box": names.get(node, node), key: answer}
+        for node, answer in answers.items()
+    ]
+    return sorted(boxes, key=lambda one: (one["box"], one["node"]))
+
+
 # -- status
 def _status(fleet: "Fleet", args: argparse.Namespace) -> int:
     boxes = _boxes(fleet)
@@ -95,51 +105,39 @@ def _top(fleet: "Fleet", args: argparse.Namespace) -> int:
     return OK
 
 
-def _boxes(fleet: "Fleet") -> list[JsonMap]:
-    """Return all boxes by name; `view` is None where it is unknown."""
-    names = fleet.boxes()
-    boxes = [
-        {"node": node, "box": names.get(node, node), "view": view and _plain(asdict(view))}
-        for node, view in fleet.views().items()
-    ]
-    return sorted(boxes, key=lambda one: (one["box"], one["node"]))
-
-
-def _plain(view: dict[str, Any]) -> JsonMap:
-    """Without what only this process can read: its own clock."""
-    del view["at"]
-    return view
+def _boxes(fleet: "Fleet") -> list[Message]:
+    boxes = _named(fleet, "view", fleet.views())
+    for one in boxes:
+        if one["view"] is not None:
+            one["view"] = asdict(one["view"])
+            del one["view"]["at"]  # on a clock that only this process has
+    return boxes
 
 
 def _status_lines(boxes: Sequence[JsonMap]) -> list[str]:
     columns = ("BOX", "GPU", "FREE", "EVICTABLE", "BUDGET", "WAITING", "MODELS")
-    rows = [row for one in boxes for row in _rows(one)]
+    rows = [row for one in boxes for row in _rows(one["box"], one["view"])]
     unknown = sum(one["view"] is None for one in boxes)
     return [f"boxes: {len(boxes)}, {unknown} {UNKNOWN}", "", *text.table(columns, rows)]
 
 
-def _rows(one: JsonMap) -> Iterator[tuple[str, ...]]:
+def _rows(box: str, view: JsonMap | None) -> Iterator[tuple[str, ...]]:
     """Yield a row for each GPU; what is of the box stands in the first."""
-    view = one["view"]
     if view is None:
-        yield (one["box"], "", UNKNOWN, "", "", "", "")
+        yield (box, "", UNKNOWN, "", "", "", "")
         return
     models = ", ".join(f"{model} ({state})" for model, state in sorted(view["resident"].items()))
     of_box = (str(view["waiting"]), models)
     for index, gpu in enumerate(view["gpus"]):
         free = UNKNOWN if gpu["free_bytes"] is None else format_bytes(gpu["free_bytes"])
         sizes = (format_bytes(gpu["evictable_bytes"]), format_bytes(gpu["budget_bytes"]))
-        yield ("" if index else one["box"], str(index), free, *sizes, *of_box)
+        yield ("" if index else box, str(index), free, *sizes, *of_box)
         of_box = ("", "")
 
 
 # -- why
 def _why(fleet: "Fleet", args: argparse.Namespace) -> int:
-    names = fleet.boxes()
-    boxes: list[Message] = [
-        {"node": node, "box": names.get(node, node), "why": reply}
-        for node, reply in fleet.why(args.consumer).items()
-    ]
+    boxes = _named(fleet, "why", fleet.why(args.consumer))
     known = [one for one in boxes if one["why"] and one["why"]["leases"]]
     lines: list[str] = []
     for one in known:

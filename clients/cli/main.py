@@ -69,6 +69,7 @@ COMMANDS: Mapping[str, Command] = {
     "calibrate": Command(
         "calibrate", "measure what a model or a program needs, for the footprint file", wraps=True
     ),
+    "remote": Command("remote", "use the models of a GPU server, over OpenSSH", traced=False),
     "doctor": Command("doctor", "check the installation, the daemon and its GPUs"),
     "selftest": Command("selftest", "prove on this machine's GPU what the product claims of it"),
     "install": Command("install", "make the arbiter a service, after showing the plan"),

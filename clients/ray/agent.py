@@ -20,7 +20,7 @@ from vram_arbiter.schemas.wire.requests import AskWhy
 NAMESPACE: Final = "vram_arbiter"
 """Of the agents' names: one for all drivers."""
 CALLS_MAX: Final = 4
-"""Questions to the arbiter at a time; others wait in the actor."""
+"""Questions to an agent at a time; one that stands still is asked no more."""
 
 
 class Agent:
@@ -60,6 +60,7 @@ def start(node: str, box: str) -> Any:
         lifetime="detached",
         num_cpus=0,
         max_concurrency=CALLS_MAX,
+        max_pending_calls=CALLS_MAX,
         scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False),
     ).remote(box)
 

@@ -4,6 +4,7 @@ by it. Ray runs and restarts actors; each box's arbiter decides what its GPU hol
 
 import contextlib
 import ipaddress
+import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -25,6 +26,7 @@ ANSWER_S: Final = 1.0
 """How long agents are waited for. Views of 1,000 boxes take half of it."""
 START_S: Final = 60.0
 """An agent or actor starts a Python that imports Ray: up to 10 s on a machine with other work."""
+CONNECT_S: Final = 3.0
 SLIVER: Final = 0.001
 """Of a node's marker, which any number of actors share."""
 
@@ -45,8 +47,6 @@ class Fleet:
     def __init__(self, rng: Random | None = None) -> None:
         self._rng = rng or Random()
         self._agents: dict[str, Any] = {}
-        self._asked: dict[str, tuple[Any, float]] = {}
-        """Questions without an answer yet, and when they were sent."""
 
     def __enter__(self) -> Self:
         """Start the agents that are missing, and wait for answers: START_S at most.
@@ -79,7 +79,6 @@ class Fleet:
         trace: TracebackType | None,
     ) -> None:
         self._agents.clear()
-        self._asked.clear()
 
     def boxes(self) -> dict[str, str]:
         """Return the name of each box by its node id: the label `box`, else the host's name."""
@@ -93,24 +92,15 @@ class Fleet:
 
     # -- what arbiters say
     def views(self, timeout_s: float = ANSWER_S) -> dict[str, View | None]:
-        """Ask all boxes at once; None: no answer, unknown. An agent that died is started again, and
-        one that is late keeps its one question."""
-        boxes = self.boxes()
-        self._ask(boxes)
-        views: dict[str, View | None] = dict.fromkeys(boxes)
-        for node, (answer, sent_at) in self._answered(timeout_s):
-            views[node] = replace(answer, at=sent_at)
-        return views
+        """Ask all boxes at once; None: no answer, unknown. An agent that died is started again with
+        the next questions."""
+        asked_at = time.monotonic()
+        answers = self._answers(timeout_s, "view")
+        return {node: view and replace(view, at=asked_at) for node, view in answers}
 
-    def why(self, consumer: str, timeout_s: float = ANSWER_S) -> dict[str, Message | None]:
+    def why(self, consumer: str) -> dict[str, Message | None]:
         """Return what each arbiter says of a consumer, by node; None: no answer."""
-        import ray
-
-        boxes = self.boxes()
-        self._ask(boxes)
-        sent = {node: self._agents[node].why.remote(consumer) for node in boxes}
-        ray.wait(list(sent.values()), num_returns=len(sent), timeout=timeout_s)
-        return {node: self._got(node, asked) for node, asked in sent.items()}
+        return dict(self._answers(ANSWER_S, "why", consumer))
 
     def order(self, need_bytes: int, model: str) -> list[Ranked]:
         """Return all boxes, best first, those of no use last, each with its reason. Raises
@@ -173,52 +163,39 @@ class Fleet:
         method: str,
         seeds: Iterable[int],
         *,
-        out: Path,
+        out: Path | str,
         deadline_s: float,
         on_result: Callable[[Result], object] | None = None,
     ) -> Iterator[Result]:
         """Yield `actor.method(seed)` of all seeds, each once: see `mapping.map_results`."""
-        return map_results(actors, method, seeds, out, deadline_s, on_result)
+        return map_results(actors, method, seeds, Path(out), deadline_s, on_result)
 
     # -- steps
-    def _ask(self, boxes: dict[str, str]) -> None:
-        """Send a question to each agent that owes no answer."""
-        for node in self._agents.keys() - boxes:
-            self._forget(node)
+    def _answers(self, timeout_s: float, method: str, *asked: str) -> Iterator[tuple[str, Any]]:
+        """Yield the answer of each node's agent; None: there is none."""
+        import ray
+
+        sent: dict[str, Any] = {}
+        boxes = self.boxes()
         for node, box in boxes.items():
             if node not in self._agents:
                 self._agents[node] = agent.start(node, box)
-            if node not in self._asked:
-                self._asked[node] = (self._agents[node].view.remote(), time.monotonic())
-
-    def _answered(self, timeout_s: float) -> Iterator[tuple[str, tuple[View, float]]]:
-        import ray
-
-        asked = dict(self._asked)
-        refs = [question for question, _ in asked.values()]
-        done, _ = ray.wait(refs, num_returns=len(refs), timeout=timeout_s) if refs else ([], None)
-        ended = set(done)
-        for node, (question, sent_at) in asked.items():
-            if question in ended:
-                del self._asked[node]
-                if (answer := self._got(node, question)) is not None:
-                    yield node, (answer, sent_at)
+            with contextlib.suppress(ray.exceptions.PendingCallsLimitExceeded):
+                sent[node] = getattr(self._agents[node], method).remote(*asked)
+        ray.wait(list(sent.values()), num_returns=len(sent), timeout=timeout_s)
+        for node in boxes:
+            yield node, self._got(node, sent.get(node))
 
     def _got(self, node: str, question: Any) -> Any:
-        """Return an agent's answer; None: there is none."""
         from ray import exceptions, get
 
         try:
-            return get(question, timeout=0)
+            return None if question is None else get(question, timeout=0)
         except (exceptions.GetTimeoutError, exceptions.RayTaskError):
             return None  # it is late, or its arbiter does not answer
         except exceptions.RayError:
-            self._forget(node)  # it is dead
+            del self._agents[node]  # it is dead
             return None
-
-    def _forget(self, node: str) -> None:
-        self._agents.pop(node, None)
-        self._asked.pop(node, None)
 
     def _untried(self, spec: LeasedSpec, tried: dict[str, str]) -> list[str]:
         ranked = self.order(spec.need_bytes, spec.model)
@@ -232,9 +209,12 @@ def connected(address: str) -> Iterator[Fleet]:
     need("a fleet", "ray", extra="ray")
     import ray
 
+    host, _, port = address.rpartition(":")
     try:
+        if host:  # else Ray looks on this machine; where nothing listens it would try for minutes
+            socket.create_connection((host, int(port)), CONNECT_S).close()
         ray.init(address=address, logging_level="ERROR", log_to_driver=False)
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         raise ArbiterUnreachable(
             f"no Ray cluster answers at {address}: {error}",
             hint="name one as HOST:PORT; where it has authentication, set RAY_AUTH_TOKEN too",

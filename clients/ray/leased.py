@@ -21,7 +21,7 @@ from typing import Any, Final, cast
 from vram_arbiter.clients._spec import Vram, lease_spec
 from vram_arbiter.clients.cuda import visible
 from vram_arbiter.clients.ray.residency import Residency
-from vram_arbiter.clients.sync import Client
+from vram_arbiter.clients.sync import Lease
 from vram_arbiter.schemas.errors import BadRequest
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
@@ -115,13 +115,13 @@ def _leased_class[C: type[Any]](made: C, spec: LeasedSpec) -> C:
         setattr(made, name, _inside_a_use(made, method))
     begin: Any = made.__init__
 
-    @wraps(begin)
     def init(self: Any, *arguments: Any, **named: Any) -> None:
         _refuse_assigned()
         self._residency = Residency(self, spec.lease, spec.wait_s)
         begin(self, *arguments, **named)
 
-    made.__init__ = init
+    # Ray signs the innermost function, and object's is none
+    made.__init__ = wraps(begin)(init) if inspect.isfunction(begin) else init
     made.leased = spec
     return made
 
@@ -166,6 +166,16 @@ def _refuse_assigned() -> None:
 
 
 # -- tasks
+class _Job:
+    """Owner of a task's lease; the task loads for itself."""
+
+    lease: Lease
+
+    def load(self) -> None: ...
+
+    def unload(self) -> None: ...
+
+
 def _leased_task(made: Any, spec: LeasedSpec) -> Any:
     options = getattr(made, "_default_options", {})
     if options.get("max_calls") != 1:
@@ -181,14 +191,9 @@ def _leased_task(made: Any, spec: LeasedSpec) -> Any:
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        name = f"{spec.lease.consumer}-{os.getpid()}"
-        with Client(name) as arbiter:
-            lease = arbiter.acquire(spec.lease, spec.wait_s)
-            os.environ.update(visible(lease.gpu, os.environ))
-            try:
-                with lease.use():
-                    return function(*arguments, **named)
-            finally:
-                lease.release(exiting=True)
+        job = _Job()
+        with Residency(job, spec.lease, spec.wait_s).call(""):
+            os.environ.update(visible(job.lease.gpu, os.environ))
+            return function(*arguments, **named)
 
     return ray.remote(**options)(call)

@@ -9,7 +9,7 @@ that is being restarted is given none.
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,8 +20,8 @@ from vram_arbiter.schemas.errors import TransientError
 ATTEMPTS_MAX: Final = 3
 """A seed whose actor dies so often, or is late, is the cause of it."""
 AWAY_MAX_S: Final = 120.0
-"""How long an actor may be refused, or not answer: a node's death is noticed within 30 s, and
-a busy machine starts an actor within a minute."""
+"""Beside a call's deadline, how long all actors may be refused or not answer: a node's death is
+noticed within 30 s, and a busy machine starts an actor within a minute."""
 PAUSE_S: Final = 0.5
 """Before an actor that failed is asked again."""
 NAMED_MAX: Final = 10
@@ -95,8 +95,6 @@ class _Worker:
     sent: Any = None
     due_at: float = 0.0
     """When the call is late; without a call: when the next one may be sent."""
-    away_since: float | None = None
-    """When it failed, or was refused, with no seed ended since."""
 
 
 def map_results(
@@ -115,37 +113,40 @@ def map_results(
     Raises: SeedsFailed at the end, if seeds have no result: what the method raised, or what befell
         its actors.
     """
-    return _Mapping(actors, method, Seeds(seeds, committed(out)), out, deadline_s).run(on_result)
+    left, workers = Seeds(seeds, committed(out)), [_Worker(actor) for actor in actors]
+    for result in _Mapping(workers, method, left, out, deadline_s).run():
+        if on_result is not None:
+            on_result(result)
+        yield result
+    left.check()
 
 
+@dataclass(slots=True)
 class _Mapping:
-    def __init__(
-        self, actors: Sequence[Any], method: str, seeds: Seeds, out: Path, deadline_s: float
-    ) -> None:
-        self._workers = [_Worker(actor) for actor in actors]
-        self._method = method
-        self._seeds = seeds
-        self._out = out
-        self._deadline_s = deadline_s
-        self._away_max_s = max(AWAY_MAX_S, deadline_s)
-        self._last_seen = "none was given"
+    workers: Sequence[_Worker]
+    method: str
+    seeds: Seeds
+    out: Path
+    deadline_s: float
+    ended_at: float = field(default_factory=time.monotonic)
+    """When a seed ended last, and did not just go back."""
+    last_seen: str = "there is none"
 
-    def run(self, on_result: Callable[[Result], object] | None) -> Iterator[Result]:
-        while self._seeds or any(worker.seed is not None for worker in self._workers):
-            if not self._workers:
-                self._seeds.strand(f"no actor is left: {self._last_seen}")
-                break
-            for worker in self._workers:
-                if worker.sent is None and self._seeds and time.monotonic() >= worker.due_at:
-                    self._send(worker, "__ray_call__", _node, self._away_max_s)
+    def run(self) -> Iterator[Result]:
+        away_max_s = AWAY_MAX_S + self.deadline_s
+        while self.seeds or any(worker.seed is not None for worker in self.workers):
+            if not self.workers or time.monotonic() - self.ended_at > away_max_s:
+                self.seeds.strand(f"no actor answers: {self.last_seen}")
+                return
+            for worker in self.workers:
+                if worker.sent is None and self.seeds and time.monotonic() >= worker.due_at:
+                    self._send(worker, "__ray_call__", _node, away_max_s)
             for worker, answered in self._ended():
                 if not answered:
                     self._late(worker)
                 elif (result := self._answer(worker)) is not None:
-                    if on_result is not None:
-                        on_result(result)
                     yield result
-        self._seeds.check()
+                    self.ended_at = time.monotonic()  # the caller may have taken its time
 
     # -- steps
     def _send(self, worker: _Worker, method: str, argument: object, within_s: float) -> None:
@@ -157,91 +158,77 @@ class _Mapping:
         whether by an answer."""
         import ray
 
-        asked = [worker for worker in self._workers if worker.sent is not None]
-        wakes = [worker.due_at for worker in self._workers if worker.sent or self._seeds]
+        asked = [worker for worker in self.workers if worker.sent is not None]
+        wakes = [worker.due_at for worker in self.workers if worker.sent or self.seeds]
         wait_s = max(0.0, min(wakes) - time.monotonic())
         if not asked:
             time.sleep(wait_s)
             return []
-        answers, _ = ray.wait([worker.sent for worker in asked], timeout=wait_s)
+        calls = [worker.sent for worker in asked]
+        ray.wait(calls, timeout=wait_s)
+        answers, _ = ray.wait(calls, num_returns=len(calls), timeout=0)  # all that there are
         now = time.monotonic()
-        return [
-            (worker, worker.sent in answers)
-            for worker in asked
-            if worker.sent in answers or worker.due_at <= now
-        ]
+        ends = [(worker, worker.sent in answers) for worker in asked]
+        return [(worker, answered) for worker, answered in ends if answered or worker.due_at <= now]
 
     def _answer(self, worker: _Worker) -> Result | None:
+        """What a body raises is not tried again: its seed fails."""
         from ray import exceptions, get
 
-        seed, sent, worker.seed, worker.sent = worker.seed, worker.sent, None, None
+        seed, worker.seed = worker.seed, None
+        sent, worker.sent = worker.sent, None
+        worker.due_at = 0.0
         try:
             value = get(sent)
         except exceptions.RayTaskError as error:
-            self._raised(worker, seed, error)
-        except exceptions.RayError as error:
-            why = _told(error)
-            if seed is not None:
-                self._seeds.lost(seed, why)
-                self._rest(worker, why)
-            elif isinstance(error, exceptions.ActorDiedError):
-                self._drop(worker, why)
+            if seed is None or isinstance(error.cause, Refused):
+                self._rest(worker, seed, error.cause)
             else:
-                self._rest(worker, why)
+                self._fail(seed, error.cause)
+        except exceptions.RayError as error:
+            self._lost(worker, seed, error)
         else:
             if seed is not None:
-                worker.away_since = None
                 return self._committed(Result(seed, worker.node, value))
             worker.node = value
-            if self._seeds:
-                worker.seed = self._seeds.take()
-                self._send(worker, self._method, worker.seed, self._deadline_s)
+            if self.seeds:
+                worker.seed = self.seeds.take()
+                self._send(worker, self.method, worker.seed, self.deadline_s)
         return None
 
-    def _raised(self, worker: _Worker, seed: int | None, error: Any) -> None:
-        """The call itself failed: what a body raises is not tried again."""
-        why = _told(error.cause)
-        if seed is None:
-            self._drop(worker, why)
-        elif isinstance(error.cause, Refused):
-            self._seeds.give_back(seed)
-            self._rest(worker, why)
-        else:
-            worker.away_since = None
-            self._seeds.failed[seed] = why
+    def _late(self, worker: _Worker) -> None:
+        """Kill an actor that does not answer; Ray restarts it."""
+        import ray
+
+        seed, worker.seed, worker.sent = worker.seed, None, None
+        ray.kill(worker.actor, no_restart=False)
+        self._lost(worker, seed, TimeoutError("no answer before the deadline"))
 
     def _committed(self, result: Result) -> Result | None:
         """None: it has another result already, or one that JSON cannot say."""
+        self.ended_at = time.monotonic()
         try:
-            return result if commit(self._out, result.seed, result.value) else None
+            return result if commit(self.out, result.seed, result.value) else None
         except (TypeError, ValueError) as error:
-            self._seeds.failed[result.seed] = f"not a JSON value: {error}"
+            self._fail(result.seed, error)
             return None
 
-    def _late(self, worker: _Worker) -> None:
-        """Kill an actor without an answer; Ray restarts it."""
-        import ray
+    def _fail(self, seed: int, error: BaseException) -> None:
+        self.ended_at = time.monotonic()
+        self.seeds.failed[seed] = _told(error)
 
-        why, seed = "no answer before the deadline", worker.seed
-        worker.seed = worker.sent = None
-        ray.kill(worker.actor, no_restart=seed is None)
-        if seed is None:
-            self._drop(worker, why)
-        else:
-            self._seeds.lost(seed, why)
-            self._rest(worker, why)
+    def _lost(self, worker: _Worker, seed: int | None, error: BaseException) -> None:
+        if seed is not None:
+            self.ended_at = time.monotonic()
+            self.seeds.lost(seed, _told(error))
+        self._rest(worker, None, error)
 
-    def _rest(self, worker: _Worker, why: str) -> None:
-        """Ask it again after a pause, until it was away for too long."""
-        now = time.monotonic()
-        worker.due_at = now + PAUSE_S
-        worker.away_since = worker.away_since or now
-        if now - worker.away_since > self._away_max_s:
-            self._drop(worker, why)
-
-    def _drop(self, worker: _Worker, why: str) -> None:
-        self._workers.remove(worker)
-        self._last_seen = why
+    def _rest(self, worker: _Worker, seed: int | None, error: BaseException) -> None:
+        """Let an actor pause; its seed, if it has not begun, goes back."""
+        worker.due_at = time.monotonic() + PAUSE_S
+        self.last_seen = _told(error)
+        if seed is not None:
+            self.seeds.give_back(seed)
 
 
 def _node(_: Any) -> str:

@@ -10,12 +10,14 @@ import asyncio
 import contextlib
 import os
 import threading
+import time
 import weakref
 from collections.abc import AsyncIterator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, Protocol
 
 from vram_arbiter.clients import use_context
@@ -59,22 +61,18 @@ class Owner(Protocol):
 
 @dataclass(slots=True, eq=False)
 class Interval:
-    """A use that several calls share; `open` while more may join."""
+    """A use that several calls share; `open` while more may join, which counts as a call."""
 
     use: AbstractAsyncContextManager[AsyncUse]
-    loop: asyncio.AbstractEventLoop
     begun: AsyncUse
-    calls: int = 1
+    loop: asyncio.AbstractEventLoop
+    calls: int = 2
     open: bool = True
-    ended: asyncio.Task[bool | None] | None = None
 
     def end(self) -> None:
         """End the use. Any thread may call."""
-        self.loop.call_soon_threadsafe(self._end)
-
-    def _end(self) -> None:
         leaving: Any = self.use.__aexit__(None, None, None)
-        self.ended = self.loop.create_task(leaving)
+        self.loop.call_soon_threadsafe(self.loop.create_task, leaving)
 
 
 class Residency:
@@ -87,6 +85,8 @@ class Residency:
         self._wait_s = wait_s
         self._client: Client | None = None
         self._lease: Lease | None = None
+        self._refused: Refused | None = None
+        self._refused_at = 0.0
         self._entering = threading.Lock()
         self._thread = ThreadPoolExecutor(1)  # of coroutines' calls
         self._interval: Interval | None = None
@@ -100,7 +100,7 @@ class Residency:
     @contextlib.contextmanager
     def call(self, label: str) -> Iterator[None]:
         """Run a block inside a use, loaded. Raises Refused, and what `load` raises."""
-        with self._inside(self._join() or self._enter(label)):
+        with self._inside(self._join() or self._enter(label, time.monotonic())):
             yield
 
     @contextlib.asynccontextmanager
@@ -112,7 +112,7 @@ class Residency:
     # -- steps
     async def _entered(self, label: str) -> Interval:
         """`_enter` in a thread. Where the caller is canceled, what it begins is ended."""
-        entering = self._thread.submit(self._enter, label)
+        entering = self._thread.submit(self._enter, label, time.monotonic())
         try:
             return await asyncio.wrap_future(entering)
         except asyncio.CancelledError:
@@ -142,10 +142,12 @@ class Residency:
             interval.calls += 1
             return interval
 
-    def _enter(self, label: str) -> Interval:
-        """Begin a use, loaded, which others may join; they wait for it here. The lease may be
-        revoked at any moment before."""
+    def _enter(self, label: str, since: float) -> Interval:
+        """Begin a use, loaded, which others may join; they wait for it here, or for its refusal.
+        The lease may be revoked at any moment before."""
         with self._entering:
+            if self._refused is not None and self._refused_at > since:
+                raise self._refused
             while (joined := self._join()) is None:
                 lease = self._loaded()
                 try:
@@ -157,21 +159,18 @@ class Residency:
     async def _begin(self, lease: Lease, label: str) -> Interval:
         """Runs on the client's loop."""
         use, loop = lease._twin.use(label), asyncio.get_running_loop()
-        self._interval = interval = Interval(use, loop, await use.__aenter__())
+        self._interval = interval = Interval(use, await use.__aenter__(), loop)
         loop.call_later(SHARE_S, self._close, interval)
         return interval
 
     def _close(self, interval: Interval) -> None:
-        with self._counting:
-            interval.open = False
-            over = not interval.calls
-        if over:
-            interval.end()
+        interval.open = False
+        self._leave(interval)
 
     def _leave(self, interval: Interval) -> None:
         with self._counting:
             interval.calls -= 1
-            over = not interval.open and not interval.calls
+            over = not interval.calls
         if over:
             interval.end()
 
@@ -186,7 +185,7 @@ class Residency:
     def _load(self) -> Lease:
         owner = self._owner()
         assert owner is not None, "its method runs"
-        owner.lease = lease = self._granted(owner)
+        owner.lease = lease = self._granted()
         outside = _within.set(_within.get() | {id(self)})
         try:
             owner.load()
@@ -199,19 +198,30 @@ class Residency:
             lease.ready()
         return lease
 
-    def _granted(self, owner: Owner) -> Lease:
+    def _granted(self) -> Lease:
         try:
             if self._client is None:
-                self._client = Client(self._name).__enter__()
-                weakref.finalize(owner, self._client.__exit__, None, None, None)
-            return self._client.acquire(self._spec, self._wait_s, unload=self._unload)
+                self._client = _connected(self._name)
+            unload = partial(_unload, self._owner)
+            return self._client.acquire(self._spec, self._wait_s, unload=unload)
         except VramError as error:
-            raise Refused(
+            self._refused_at = time.monotonic()
+            self._refused = Refused(
                 f"{self._name} is not granted here: {error.message}",
                 hint="place it on another box, or raise wait_s",
                 details={"code": error.code, **error.details},
-            ) from None
+            )
+            raise self._refused from None
 
-    def _unload(self) -> None:
-        if (owner := self._owner()) is not None:
-            owner.unload()
+
+def _connected(name: str) -> Client:
+    """A client that is left, with its leases, when it is collected."""
+    client = Client(name).__enter__()
+    client._dropped.detach()  # which would warn
+    weakref.finalize(client, client._portal.abandon, client._connection)
+    return client
+
+
+def _unload(owner: weakref.ref[Owner]) -> None:
+    if (alive := owner()) is not None:
+        alive.unload()

@@ -1,11 +1,12 @@
 """The process at the other end of a unix socket, as the kernel names it.
 
-SO_PEERCRED holds the credentials of the moment of connecting. A pid alone is reused, so a pidfd is
+SO_PEERCRED and SO_PEERGROUPS hold the credentials of the moment of connecting. A pid alone is reused, so a pidfd is
 opened at once and the start time is read while the pidfd shows the process alive: the three name
 one process for ever.
 """
 
 import os
+import pwd
 import select
 import socket
 import struct
@@ -16,6 +17,10 @@ from vram_arbiter.schemas.runtime import procfs
 
 SO_PEERPIDFD = 77
 """Linux ≥ 6.5, asm-generic/socket.h; the socket module of Python 3.12 does not name it."""
+SO_PEERGROUPS = 59
+"""Linux ≥ 4.13, as above."""
+_GROUPS_BYTES = 1024
+"""The most that `getsockopt` of Python takes: 256 groups of four bytes."""
 _UCRED = struct.Struct("iII")  # pid, uid, gid (unix(7))
 
 
@@ -36,6 +41,19 @@ class Peer:
     uid: int
     gid: int
     pidfd: int
+    groups: tuple[int, ...] = ()
+    """Supplementary groups; () where there are more than 256."""
+
+    def belongs_to(self, group: int) -> bool:
+        """Return whether a group is the process's own, or by its account the user's: neither a
+        machine without this account nor a process that has left the group hides it."""
+        if group in (self.gid, *self.groups):
+            return True
+        try:
+            account = pwd.getpwuid(self.uid)
+        except KeyError:
+            return False
+        return group in os.getgrouplist(account.pw_name, account.pw_gid)
 
 
 def credentials(sock: socket.socket) -> tuple[int, int, int]:
@@ -46,6 +64,14 @@ def credentials(sock: socket.socket) -> tuple[int, int, int]:
     return pid, uid, gid
 
 
+def _groups(sock: socket.socket) -> tuple[int, ...]:
+    try:
+        found = sock.getsockopt(socket.SOL_SOCKET, SO_PEERGROUPS, _GROUPS_BYTES)
+    except OSError:  # ERANGE: too many
+        return ()
+    return struct.unpack(f"{len(found) // 4}I", found)
+
+
 def identify(sock: socket.socket) -> Peer:
     """Return the process at the other end of an accepted unix socket, with a pidfd that the caller
     closes.
@@ -54,7 +80,7 @@ def identify(sock: socket.socket) -> Peer:
     """
     pid, uid, gid = credentials(sock)
     if pid == 0:
-        return Peer(ProcessKey(0, 0), uid, gid, -1)
+        return Peer(ProcessKey(0, 0), uid, gid, -1, _groups(sock))
     try:
         pidfd = sock.getsockopt(socket.SOL_SOCKET, SO_PEERPIDFD)
         certain = True
@@ -73,7 +99,7 @@ def identify(sock: socket.socket) -> Peer:
     except BaseException:
         os.close(pidfd)
         raise
-    return Peer(ProcessKey(pid, stat.start_ticks), uid, gid, pidfd)
+    return Peer(ProcessKey(pid, stat.start_ticks), uid, gid, pidfd, _groups(sock))
 
 
 def _open(pid: int) -> int:

@@ -14,7 +14,7 @@ import resource
 import socket
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -228,7 +228,7 @@ class Router:
                 self.loop.add_reader(peer.pidfd, self._process_ended, peer.process)
         else:
             _close(peer.pidfd)
-            peer = Peer(peer.process, peer.uid, peer.gid, process.pidfd)
+            peer = replace(peer, pidfd=process.pidfd)
         user = self._users.setdefault(peer.uid, User())
         user.connections += 1
         self._serial += 1

@@ -1,13 +1,16 @@
 """Each program of `examples/` against a real daemon with a simulated GPU."""
 
+import os
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
+from tests.support.boxes import Boxes
 from tests.support.prepared import run
 from tests.support.process import ArbiterProcess, Finished
 from tests.support.running import running
@@ -34,11 +37,11 @@ def said_by(daemon: ArbiterProcess, name: str, *arguments: str) -> str:
     return done.stdout
 
 
-def event_kinds(daemon: ArbiterProcess, consumer: str) -> list[str]:
-    """Kinds of the history events of a consumer, in order."""
+def event_kinds(daemon: ArbiterProcess, consumer: str | None = None) -> list[str]:
+    """Kinds of the history events of a consumer, or of all, in order."""
     with Client("test", endpoint=daemon.endpoint) as arbiter:
         events = arbiter.history().events
-    return [event["kind"] for event in events if event.get("consumer") == consumer]
+    return [event["kind"] for event in events if consumer in (None, event.get("consumer"))]
 
 
 def in_order(wanted: Sequence[str], said: Sequence[str]) -> bool:
@@ -124,3 +127,24 @@ def test_a_client_in_another_language(arbiter_daemon: ArbiterProcess) -> None:
     assert said[1:] == ["working", "released"]
     story = ["granted", "ready", "use_began", "use_ended", "released"]
     assert in_order(story, event_kinds(arbiter_daemon, "sorter"))
+
+
+@pytest.mark.nightly
+def test_a_fleet(short_folder: Path, tmp_path: Path) -> None:
+    program = [sys.executable, str(EXAMPLES / "fleet.py"), str(tmp_path / "out")]
+    said = []
+    with Boxes(short_folder, nodes=1) as boxes:
+        for _ in range(2):
+            done = subprocess.run(
+                program, env=os.environ | {"RAY_ADDRESS": boxes.address},
+                capture_output=True, text=True, timeout=LIMIT_S, check=False,
+            )  # fmt: skip
+            assert done.returncode == 0, done.stderr
+            said.append(done.stdout.splitlines())
+        told = event_kinds(boxes.nodes[0].daemon)
+    assert sorted(line.partition(",")[0] for line in said[0]) == [
+        f"episode {seed}: {seed % 3 > 0}" for seed in range(6)
+    ]
+    assert all("weights on GPU-fake-" in line for line in said[0])
+    assert said[1] == []
+    assert in_order(["granted", "ready", "use_began", "use_ended"], told)

@@ -3,8 +3,9 @@ on boxes that exist only here, and prints what becomes of it.
 
 Boxes have one GPU with leases of fifty models; a placed model stays HOLD_S on average. Who places
 sees the boxes as they were up to `stale_s` ago. A placement that finds its GPU full waits there.
-Each row compares the order's first box with two random choices among equals, and with an order that
-puts boxes with the model first although no copy fits beside it.
+Each row compares the order's first box with two random choices among equals, with an order that
+puts boxes with the model first although no copy fits beside it, and with one that asks for room
+alone.
 """
 
 import argparse
@@ -127,6 +128,13 @@ def model_first(
     )
 
 
+def room_alone(
+    views: Mapping[str, View | None], need: int, model: str, now: float, rng: Random
+) -> str | None:
+    """Two choices among the boxes with room, whatever models they have."""
+    return two_choices(views, need, "", now, rng)
+
+
 def _strict(one: Ranked) -> tuple[int, int, int, str]:
     return list(Reason).index(one.reason), one.waiting, -(one.free_bytes or 0), one.node
 
@@ -170,6 +178,7 @@ POLICIES: Final[Mapping[str, Choose]] = {
     "first": first,
     "two choices": two_choices,
     "model first": model_first,
+    "room alone": room_alone,
 }
 
 

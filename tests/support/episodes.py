@@ -9,25 +9,44 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from vram_arbiter.clients.ray import leased
+from vram_arbiter.clients.ray import LeasedSpec, leased
 from vram_arbiter.schemas.fakegpu import LOG_FILE
 from vram_arbiter.testing.gpu import FakeGpu
 
-SIZE = "5GiB"
-"""Two do not fit on a simulated GPU of 8 GiB."""
+
+class Bare:
+    """Has no model, and does nothing when it is called."""
+
+    def load(self) -> None: ...
+
+    def unload(self) -> None: ...
+
+    def ping(self) -> None: ...
 
 
-@leased(vram=SIZE, model="episodes", wait_s=60)
-class Player:
+class BareAsync(Bare):
+    async def ping(self) -> None: ...  # type: ignore[override]
+
+
+@leased(vram="1GiB", model="calls")
+class Caller(Bare): ...
+
+
+@leased(vram="1GiB", model="calls")
+class CallerAsync(BareAsync): ...
+
+
+class Episodes(Bare):
     """Plays episodes of `seconds`, and notes each in `folder`."""
 
+    leased: LeasedSpec
     lease: Any
 
     def __init__(self, folder: str, seconds: float) -> None:
         self._folder, self._seconds = Path(folder), seconds
 
     def load(self) -> None:
-        FakeGpu(name="player").allocate(SIZE)
+        FakeGpu(name="player").allocate(self.leased.need_bytes)
 
     def unload(self) -> None:
         FakeGpu().free()
@@ -39,8 +58,15 @@ class Player:
         note(self._folder, "ended", seed, begun, time.monotonic())
         return {"seed": seed, "pid": os.getpid()}
 
-    def ping(self, x: int = 0) -> int:
-        return x
+
+@leased(vram="5GiB", model="episodes", wait_s=60)
+class Player(Episodes):
+    """Two do not fit on a simulated GPU of 8 GiB."""
+
+
+@leased(vram="2GiB", model="small")
+class SmallPlayer(Episodes):
+    """Three fit."""
 
 
 def note(folder: Path, what: str, seed: int, begun: float, now: float) -> None:

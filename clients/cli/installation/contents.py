@@ -13,6 +13,7 @@ SYSUSERS, TMPFILES, PROFILE = (
     for name, kind in (("sysusers", "conf"), ("tmpfiles", "conf"), ("profile", "sh"))
 )
 OF_SNIPPETS = (("systemd-sysusers", SYSUSERS), ("systemd-tmpfiles", "--create", TMPFILES))
+SSHD = Path("/etc/ssh/sshd_config.d")
 SHIPPED = Path(vram_arbiter.__file__).parent / "configs"
 _PREFIX = "/opt/vram-arbiter"  # of the shipped files
 _ON_GPU = ("vram-arbiter.service", "vram-sidecar@.service", "vram-runner@.service")
@@ -30,6 +31,8 @@ def wanted(site: Site, prefix: Path) -> dict[Path, str]:
         for name in (SYSUSERS, TMPFILES, PROFILE):
             shipped[Path(name)] = _read(f"systemd/{name.removeprefix('/etc/')}")
         shipped |= _of_tegra(site)
+        if site.folder(SSHD).is_dir():  # robots come by ssh, or not at all
+            shipped[SSHD / "vram-guests.conf"] = _read("ssh/vram-guests.conf")
     files = {path: text.replace(_PREFIX, str(prefix)) for path, text in shipped.items()}
     for name in ("arbiter.yaml", "observer.yaml"):
         example = _read(name).replace("$schema=../", f"$schema={SHIPPED.parent}/", 1)  # for editors

@@ -49,3 +49,19 @@ def test_a_use_ended_before_its_begin_was_answered_stays_ended(link: Wire) -> No
     link.told()
     link.greet()
     assert link.sent() == []
+
+
+def test_the_arbiter_hears_of_a_client_in_a_use_also_while_it_pushes(link: Wire) -> None:
+    """A guest that is silent loses its uses, and a subscriber of a busy arbiter pinged no more."""
+    link.foreign_uses.begin(BEGIN, link.now, REQUEST_TIMEOUT_S)
+    link.reply(link.one("use_begin"))
+    link.tick(1.5)
+    link.push("event", event={"seq": 1, "kind": "granted"})
+    link.tick(0.5)
+    link.reply(link.one("ping"))
+    link.foreign_uses.end(END, link.now)
+    link.reply(link.one("use_end"))
+    link.tick(1.5)
+    link.push("event", event={"seq": 2, "kind": "granted"})
+    link.tick(0.5)
+    assert link.sent() == [], "without a use pushes are enough"

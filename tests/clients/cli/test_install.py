@@ -224,6 +224,17 @@ def test_a_jetson_gets_the_device_nodes_that_it_has(root: Path) -> None:
     assert f"DeviceAllow={node} rw\n" in (root / f"{SIDECAR}.d/tegra.conf").read_text()
 
 
+def test_sshd_is_told_of_guests_where_there_is_one(root: Path) -> None:
+    drop_in = root / "etc/ssh/sshd_config.d/vram-guests.conf"
+    assert vramctl(root, "install", "--yes") == 0
+    assert not drop_in.exists()
+    drop_in.parent.mkdir(parents=True)
+    assert vramctl(root, "install", "--yes") == 0
+    assert "Match Group vram-guests" in drop_in.read_text()
+    assert vramctl(root, "uninstall", "--yes") == 0
+    assert not drop_in.exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

@@ -68,7 +68,7 @@ def test_help_names_every_command_and_the_exit_codes(nowhere: dict[str, str]) ->
 COMMANDS = {
     "clients": (
         "", "status", "why", "history", "top", "evict", "pin", "unpin", "drain", "resume",
-        "release-dead", "run", "doctor", "mcp", "replay", "demo",
+        "release-dead", "run", "doctor", "mcp", "replay", "demo", "fleet",
     ),
     "runner": ("", "sim", "deploy", "estop"),
     "arbiter": ("",), "arbiter.offline": ("replay",), "sidecars": ("",), "reasoner": ("",),

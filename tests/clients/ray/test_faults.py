@@ -8,16 +8,22 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.support.boxes import MARKER, Box, Boxes
+from tests.support.boxes import MARKER, Boxes
 from tests.support.episodes import Player, freed_inside, noted
 from tests.support.fakegpu_check import check_log
+from tests.support.processes import alive
+from tests.support.waiting import until
+from vram_arbiter.clients.ray import Fleet, leased
 from vram_arbiter.clients.ray.mapping import Result, map_results
 from vram_arbiter.clients.results import committed
+from vram_arbiter.clients.sync import Client
+from vram_arbiter.testing.timeline import Timeline
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(600)]
 
@@ -39,27 +45,24 @@ def notes(tmp_path: Path) -> Path:
     return made
 
 
-Make = Callable[[Box], Any]
+Start = Callable[[int], list[Any]]
 
 
 @pytest.fixture
-def player(notes: Path) -> Iterator[Make]:
-    """`player(box)`: an actor on a box, which moves if the box is gone."""
+def start(boxes: Boxes, notes: Path) -> Iterator[Start]:
+    """`start(per_node)`: actors of each box, in the boxes' order; they move if theirs is gone."""
     import ray
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     made = []
+    with Fleet() as fleet:
 
-    def make(box: Box) -> Any:
-        where = NodeAffinitySchedulingStrategy(box.node_id, soft=True)
-        actor = ray.remote(Player).options(  # type: ignore[attr-defined]
-            num_cpus=0, resources={MARKER: 0.001}, scheduling_strategy=where,
-            max_restarts=-1, max_task_retries=-1,
-        ).remote(str(notes), EPISODE_S)  # fmt: skip
-        made.append(actor)
-        return actor
+        def start(per_node: int) -> list[Any]:
+            for box in boxes.nodes:
+                where = {"per_node": per_node, "nodes": [box.node_id]}
+                made.extend(fleet.spread(Player, str(notes), EPISODE_S, **where))
+            return made
 
-    yield make
+        yield start
     for actor in made:
         ray.kill(actor)
 
@@ -67,7 +70,8 @@ def player(notes: Path) -> Iterator[Make]:
 def pid_of(actor: Any) -> int:
     import ray
 
-    pid: int = ray.get(actor.__ray_call__.remote(lambda self: os.getpid()))
+    call = actor.__ray_call__.options(max_task_retries=-1)
+    pid: int = ray.get(call.remote(lambda self: os.getpid()))
     return pid
 
 
@@ -103,9 +107,9 @@ def check_gpus(boxes: Boxes, notes: Path) -> None:
 
 
 def test_each_seed_once_and_models_take_turns_between_calls(
-    boxes: Boxes, player: Make, notes: Path, tmp_path: Path
+    boxes: Boxes, start: Start, notes: Path, tmp_path: Path
 ) -> None:
-    actors = [player(box) for box in boxes.nodes for _ in range(2)]
+    actors = start(2)
     out = tmp_path / "out"
     results = play(actors, out, {})
     check_each_once(results, out)
@@ -116,32 +120,68 @@ def test_each_seed_once_and_models_take_turns_between_calls(
 
 
 def test_a_daemon_is_restarted_under_actors(
-    boxes: Boxes, player: Make, notes: Path, tmp_path: Path
+    boxes: Boxes, start: Start, notes: Path, tmp_path: Path
 ) -> None:
     def restart() -> None:
         boxes.nodes[1].daemon.kill()
         boxes.nodes[1].daemon.start()
 
     out = tmp_path / "out"
-    actors = [player(box) for box in boxes.nodes]
+    actors = start(1)
     check_each_once(play(actors, out, {12: restart}), out)
     assert set(Counter(one["seed"] for one in noted(notes, "begun")).values()) == {1}
     check_gpus(boxes, notes)
 
 
-def test_a_process_stands_still(boxes: Boxes, player: Make, notes: Path, tmp_path: Path) -> None:
+def test_a_process_stands_still(boxes: Boxes, start: Start, notes: Path, tmp_path: Path) -> None:
     """Ray gives no error of it: its deadline ends it."""
-    actors = [player(box) for box in boxes.nodes]
-    pids = [pid_of(actor) for actor in actors]
-    out = tmp_path / "out"
-    stop = {12: lambda: os.kill(pids[1], signal.SIGSTOP)}
-    check_each_once(play(actors, out, stop, deadline_s=5.0), out)
+    actors = start(1)
+    pid, out = pid_of(actors[1]), tmp_path / "out"
+    with ThreadPoolExecutor(1) as pool:
+        frozen = pool.submit(until, lambda: frozen_inside(notes, pid))
+        check_each_once(play(actors, out, {}, deadline_s=5.0), out)
+        assert frozen.result()
+    until(lambda: not alive(pid))
     check_gpus(boxes, notes)
-    assert pid_of(actors[1]) != pids[1]
+    assert pid_of(actors[1]) != pid
+
+
+def frozen_inside(notes: Path, pid: int) -> bool:
+    """Stop a process; it goes on if that was not inside an episode."""
+
+    def inside() -> bool:
+        return [one["pid"] for what in ("begun", "ended") for one in noted(notes, what)].count(
+            pid
+        ) % 2 == 1
+
+    if not inside():
+        return False
+    os.kill(pid, signal.SIGSTOP)
+    if not inside():
+        os.kill(pid, signal.SIGCONT)
+        return False
+    return True
+
+
+def test_a_leased_task_ends_with_its_lease(boxes: Boxes) -> None:
+    import ray
+
+    def job() -> int:
+        return os.getpid()
+
+    task: Any = leased(vram="5GiB", model="job")(ray.remote(max_calls=1)(job))
+    pids = [ray.get(task.options(resources={MARKER: 0.001}).remote()) for _ in range(2)]
+    assert pids[0] != pids[1]
+    for box in boxes.nodes:
+        with Client("test", endpoint=box.daemon.endpoint) as arbiter:
+            until(lambda arbiter=arbiter: not arbiter.status().leases)
+    granted = [one for box in boxes.nodes for one in Timeline(box.daemon).events("granted")]
+    consumers = {one["consumer"] for one in granted}
+    assert {f"job-{pid}" for pid in pids} <= consumers
 
 
 def test_a_node_and_its_arbiter_are_killed(
-    boxes: Boxes, player: Make, notes: Path, tmp_path: Path
+    boxes: Boxes, start: Start, notes: Path, tmp_path: Path
 ) -> None:
     killed_at: list[float] = []
 
@@ -150,7 +190,7 @@ def test_a_node_and_its_arbiter_are_killed(
         boxes.kill("n1")
 
     out = tmp_path / "out"
-    actors = [player(box) for box in boxes.nodes]
+    actors = start(1)
     check_each_once(play(actors, out, {12: kill}), out)
     assert time.monotonic() - killed_at[0] < 120.0  # `make bench-fleet` measures it
     check_gpus(boxes, notes)

@@ -19,10 +19,16 @@ from tests.support.episodes import Player
 from tests.support.waiting import PATIENCE_S, until
 from vram_arbiter.clients.ray import Fleet, Reason, View, leased
 from vram_arbiter.clients.ray import agent as agents
-from vram_arbiter.clients.ray.fleet import _options, refuse_bytes, refuse_open
+from vram_arbiter.clients.ray.fleet import _options, connected, refuse_bytes, refuse_open
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.defaults import GIB
-from vram_arbiter.schemas.errors import BadRequest, ConfigError, NotPermitted, VramInsufficient
+from vram_arbiter.schemas.errors import (
+    ArbiterUnreachable,
+    BadRequest,
+    ConfigError,
+    NotPermitted,
+    VramInsufficient,
+)
 
 raylets = pytest.mark.nightly
 pytestmark = [pytest.mark.heavy, pytest.mark.timeout(600)]
@@ -70,6 +76,13 @@ def test_gpus_and_bytes_beside_a_lease_are_refused() -> None:
 def test_a_fleet_needs_a_connection() -> None:
     with pytest.raises(ConfigError, match="no connection to Ray"):
         Fleet().__enter__()
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "127.0.0.1:port"])
+def test_an_address_without_a_cluster_is_refused_at_once(address: str) -> None:
+    """Ray itself tries for minutes."""
+    with pytest.raises(ArbiterUnreachable, match=f"no Ray cluster answers at {address}: "):
+        connected(address).__enter__()
 
 
 # -- with raylets
@@ -170,7 +183,8 @@ def test_an_actor_whose_wait_ends_is_placed_on_the_next_box(boxes: Boxes, fleet:
             order = [(one.box, one.reason) for one in fleet.order(6 * GIB, "waits")]
             assert order == [("n0", Reason.EVICTABLE), ("n1", Reason.BUSY)]
             placing = pool.submit(fleet.place, Waits)
-            until(lambda: busy.status().totals.waiting == 1)
+            until(lambda: placing.done() or busy.status().totals.waiting == 1)
+            assert not placing.done(), placing.exception()
             waited = [one.consumer for one in stuck.status().leases if one.state == "queued"]
             assert waited == []
         actor = placing.result(PATIENCE_S)

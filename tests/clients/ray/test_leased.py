@@ -2,6 +2,7 @@
 
 import asyncio
 import gc
+import inspect
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -138,13 +139,19 @@ def test_a_load_that_fails_gives_the_lease_up(make: Make, client: Client) -> Non
 
 
 @pytest.mark.e2e
-def test_a_wait_that_ends_is_refused(make: Make, client: Client, spec: Spec) -> None:
-    model = make(wait_s=0.1)
-    with client.lease(spec("other", 5, evictable=False)) as pinned:
+def test_a_wait_that_ends_is_refused_to_all_that_waited(
+    make: Make, client: Client, spec: Spec, arbiter_daemon: ArbiterProcess
+) -> None:
+    """Each waited for a time limit of its own, one after the other."""
+    model = make(wait_s=1.0)
+    with client.lease(spec("other", 5, evictable=False)) as pinned, ThreadPoolExecutor(4) as pool:
         pinned.ready()
-        with pytest.raises(Refused, match="not granted here") as refused:
-            model.act(1)
-        assert refused.value.details["code"] == "wait_timeout"
+        waiting = [pool.submit(model.act, 1) for _ in range(4)]
+        for one in waiting:
+            with pytest.raises(Refused, match="not granted here") as refused:
+                one.result(PATIENCE_S)
+            assert refused.value.details["code"] == "wait_timeout"
+        assert len(Timeline(arbiter_daemon).events("denied")) == 1
     assert model.act(1) == 1
 
 
@@ -210,6 +217,19 @@ def test_bytes_and_gpus_beside_a_lease_are_refused_by_name() -> None:
     for name in ("num_gpus", "GPU", "vram_bytes"):
         with pytest.raises(BadRequest, match=name):
             refuse_resources([name])
+
+
+def test_methods_are_functions_to_their_core() -> None:
+    """Ray puts a signature on the innermost one; it refused classes without `__init__`."""
+
+    class Bare:
+        def load(self) -> None: ...
+
+        def unload(self) -> None: ...
+
+    for made in (Bare, Model):
+        kept = type(made.__name__, (made,), {})
+        assert inspect.isfunction(inspect.unwrap(leased(vram="5GiB", model="m")(kept).__init__))
 
 
 def test_only_idempotent_methods_are_sent_again() -> None:

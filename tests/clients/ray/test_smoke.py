@@ -17,7 +17,7 @@ def test_a_seed_is_played_on_a_box(short_folder: Path, tmp_path: Path) -> None:
         (box,) = boxes.nodes
         with Fleet() as fleet:
             (actor,) = fleet.spread(Player, str(tmp_path), 0.0)
-            (result,) = fleet.map([actor], "episode", [7], out=tmp_path / "out", deadline_s=60.0)
+            (result,) = fleet.map([actor], "episode", [7], out=f"{tmp_path}/out", deadline_s=60.0)
             assert result == Result(7, box.node_id, result.value)
             assert result.value["seed"] == 7
             (view,) = fleet.views().values()

@@ -1,0 +1,1 @@
+"""A robot and its GPU server, over OpenSSH: nothing of the product listens on a network."""
