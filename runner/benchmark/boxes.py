@@ -10,7 +10,7 @@ import contextlib
 import os
 import threading
 from collections.abc import AsyncIterator, Coroutine, Iterator, Sequence
-from concurrent.futures import wait
+from concurrent.futures import as_completed, wait
 from pathlib import Path
 from typing import Any, Final
 
@@ -60,9 +60,8 @@ class Boxes:
             Worker, self._argv, cell, os.getcwd(), per_node=self._count, nodes=list(fleet.boxes())
         )
         try:
-            for result in fleet.map(
-                workers, "play", seeds, out=folder, deadline_s=self._deadline_s
-            ):
+            able = self._able(workers, seeds)
+            for result in fleet.map(able, "play", seeds, out=folder, deadline_s=self._deadline_s):
                 yield SeedOutcome(**result.value)
         except SeedsFailed as error:
             for seed, why in error.details["failed"].items():
@@ -70,6 +69,19 @@ class Boxes:
                 yield lost
         finally:  # before another cell looks for sidecars
             wait([worker.close.remote().future() for worker in workers], CLOSE_S)
+
+    def _able(self, workers: Sequence[Any], seeds: Sequence[int]) -> list[Any]:
+        """Wait for the first worker that can play, and leave out those that cannot. Raises
+        SeedsFailed for all seeds where none can.
+        """
+        begun = {worker.__ray_ready__.remote().future(): worker for worker in workers}
+        failed, why = set[Any](), "no box"
+        for future in as_completed(begun):
+            if (error := future.exception()) is None:
+                return [worker for worker in workers if worker not in failed]
+            failed.add(begun[future])
+            why = str(error).strip().splitlines()[-1]  # behind where it was raised
+        raise SeedsFailed(why, details={"failed": dict.fromkeys(map(str, seeds), why)})
 
 
 class Worker:

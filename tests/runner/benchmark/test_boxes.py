@@ -16,23 +16,31 @@ from vram_arbiter.clients.results import commit
 from vram_arbiter.runner.__main__ import main
 from vram_arbiter.runner.benchmark import boxes, folder
 from vram_arbiter.runner.benchmark.outcomes import SeedOutcome
-from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.errors import ConfigError, VramError
 
 pytestmark = pytest.mark.heavy
 
-PLAYED = ["benchmark", "--policy", "expert", "--policy", "random", "--max-steps", "45"]
-
 
 class Actor:
-    """An object as an actor, whose methods return futures."""
+    """An object as an actor, whose methods return futures, and fail where it could not be made."""
 
-    def __init__(self, made: Any) -> None:
-        self.made = made
+    def __init__(self, cls: Any, arguments: Sequence[Any]) -> None:
+        self.made, self.error = None, None
+        try:
+            self.made = cls(*arguments)
+        except VramError as error:
+            self.error = RuntimeError(
+                f"Traceback:\n  in __init__\n{type(error).__name__}: {error}\n"
+            )
 
     def __getattr__(self, method: str) -> Any:
         def remote(*arguments: Any) -> Any:
             future = Future[Any]()
-            future.set_result(getattr(self.made, method)(*arguments))
+            if self.error is not None:
+                future.set_exception(self.error)
+            else:
+                ready = method == "__ray_ready__"
+                future.set_result(ready or getattr(self.made, method)(*arguments))
             return SimpleNamespace(future=lambda: future)
 
         return SimpleNamespace(remote=remote)
@@ -48,7 +56,7 @@ class Here:
         return {"id": "here"}
 
     def spread(self, cls: Any, *args: Any, per_node: int, nodes: Sequence[str]) -> list[Any]:
-        return [Actor(cls(*args)) for _ in nodes for _ in range(per_node)]
+        return [Actor(cls, args) for _ in nodes for _ in range(per_node)]
 
     def map(
         self,
@@ -69,9 +77,10 @@ class Here:
             raise SeedsFailed("seeds have no result", details=details)
 
 
-def played(out: Path) -> list[tuple[Any, ...]]:
-    cells = json.loads((out / "benchmark.json").read_text(encoding="utf-8"))["cells"]
-    return [(e["seed"], e["success"], e["steps"]) for cell in cells for e in cell["episodes"]]
+def episodes(out: Path) -> list[dict[str, Any]]:
+    (cell,) = json.loads((out / "benchmark.json").read_text(encoding="utf-8"))["cells"]
+    found: list[dict[str, Any]] = cell["episodes"]
+    return found
 
 
 def test_outcomes_are_told_and_lost_seeds_are_errors(tmp_path: Path, run_async: Any) -> None:
@@ -90,6 +99,16 @@ def test_outcomes_are_told_and_lost_seeds_are_errors(tmp_path: Path, run_async: 
         "00001.json",
         "00002.json",
     ]
+
+
+def test_without_a_box_that_can_play_seeds_are_errors(tmp_path: Path, run_async: Any) -> None:
+    argv = ["benchmark", "--skill", "vram-arbiter/so101-navigate", "--no-videos"]
+    argv += ["--arbiter", f"ipc://{tmp_path}/none.sock"]
+    told: list[SeedOutcome] = []
+    fleet: Any = Here()
+    run_async(boxes.Boxes(fleet, argv, 1, 60.0).play(0, [0, 1], tmp_path / "out", told.append))
+    assert [one.success for one in told] == [None, None]
+    assert told[0].message.startswith("ArbiterUnreachable: ")
 
 
 def test_a_box_without_the_runs_folders_says_so(tmp_path: Path) -> None:
@@ -117,7 +136,7 @@ def test_what_boxes_cannot_do_is_refused(
 
 
 @pytest.mark.nightly
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(600)
 @pytest.mark.usefixtures("forked_workers")
 def test_raylets_play_what_local_processes_do_and_a_dead_box_costs_no_seed(
     short_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
@@ -125,31 +144,36 @@ def test_raylets_play_what_local_processes_do_and_a_dead_box_costs_no_seed(
     from tests.support.boxes import Boxes
     from tests.support.waiting import until
 
-    seeds = ["--episodes", "4", "--seed", "20"]
     local, away = tmp_path / "local", tmp_path / "away"
-    assert main([*PLAYED, *seeds, "--out", str(local)]) == 0
+    flags = ["benchmark", "--policy", "expert", "--max-steps", "45", "--episodes", "6"]
+    assert main([*flags, "--out", str(local)]) == 0
     table = capfd.readouterr().out.replace(str(local), "")
     with Boxes(short_folder, nodes=2) as fleet:
-        ray = ["--ray", fleet.address]
-        results = away / folder.RESULTS
 
         def kill() -> None:
-            until(lambda: len(list(results.glob("*/*.json"))) >= 2, deadline_s=600)
+            until(lambda: any(away.glob("results/*/*.json")), deadline_s=300)
             fleet.kill(fleet.nodes[1].name)
 
         killing = threading.Thread(target=kill)
         killing.start()
         try:
-            assert main([*PLAYED, *seeds, *ray, "--out", str(away)]) == 0
+            assert main([*flags, "--ray", fleet.address, "--out", str(away)]) == 0
         finally:
             killing.join()
-        assert capfd.readouterr().out.replace(str(away), "") == table
-        assert played(away) == played(local)
-        cells = json.loads((away / "benchmark.json").read_text(encoding="utf-8"))["cells"]
-        for episode in (episode for cell in cells for episode in cell["episodes"]):
-            assert (away / episode["video"]).stat().st_size
-        skill = ["--skill", "vram-arbiter/so101-navigate", "--arbiter", "ipc:///none.sock"]
-        lost = tmp_path / "lost"
-        assert main(["benchmark", *skill, *seeds, *ray, "--out", str(lost)]) == 1
-        (cell,) = json.loads((lost / "benchmark.json").read_text(encoding="utf-8"))["cells"]
-        assert "ArbiterUnreachable" in cell["why"]
+    assert capfd.readouterr().out.replace(str(away), "") == table
+    assert [(e["seed"], e["success"], e["steps"]) for e in episodes(away)] == [
+        (e["seed"], e["success"], e["steps"]) for e in episodes(local)
+    ]
+    assert all((away / e["video"]).stat().st_size for e in episodes(away))
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(600)
+def test_without_a_box_that_can_play_the_seeds_say_why(short_folder: Path, tmp_path: Path) -> None:
+    from tests.support.boxes import Boxes
+
+    skill = ["--skill", "vram-arbiter/so101-navigate", "--arbiter", f"ipc://{tmp_path}/none.sock"]
+    with Boxes(short_folder, nodes=1) as fleet:
+        argv = ["benchmark", *skill, "--ray", fleet.address, "--out", str(tmp_path / "out")]
+        assert main(argv) == 1
+    assert "ArbiterUnreachable" in episodes(tmp_path / "out")[0]["message"]
