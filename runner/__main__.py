@@ -55,7 +55,9 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     second of motion before an emergency stop."""
     given = sys.argv[1:] if argv is None else argv
     known = bool(given) and given[0] in COMMANDS
-    return parser(given[:1] if known else COMMANDS).parse_args(given)
+    args = parser(given[:1] if known else COMMANDS).parse_args(given)
+    args.argv = given  # for a command that starts itself elsewhere
+    return args
 
 
 @terminal.program

@@ -50,7 +50,7 @@ LONGEST = (
     "tests/runner/skills/test_policies_as_lerobot.py",
     "tests/runner/robots/test_lerobot_robot.py",
     "tests/runner/cli/",
-    "tests/runner/sim/test_benchmark.py",
+    "tests/runner/benchmark/",
     "tests/bench/",
     "tests/clients/observer/",
     "tests/clients/selftest/",

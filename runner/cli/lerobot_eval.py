@@ -17,10 +17,10 @@ from pathlib import Path
 
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.output_paths import check_output
-from vram_arbiter.runner.cli.benchmark_report import MAX_STEPS, REPORT, table, write_report
+from vram_arbiter.runner.benchmark.outcomes import Cell, SeedOutcome
+from vram_arbiter.runner.benchmark.report import MAX_STEPS, PAGE, REPORT, table, write_report
 from vram_arbiter.runner.cli.common import default_skills, install_signals
 from vram_arbiter.runner.goals.catalogue import read_manifests
-from vram_arbiter.runner.sim.benchmark import Cell, SeedOutcome
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import Kind, RSkillManifest
 from vram_arbiter.schemas.manifest.vocabulary import Dtype
@@ -67,8 +67,8 @@ async def evaluate(args: argparse.Namespace) -> int:
         cells += cells_of(manifest, args, out, code)
         complete = number == len(wanted) and all(cell.complete for cell in cells)
         write_report(args, cells, complete=complete)
-    print(printable_lines(table([cell.summary() for cell in cells])))
-    print(f"{args.out / REPORT}")
+    print(printable_lines(table(cells)))
+    print(f"{args.out / REPORT}\n{args.out / PAGE}")
     return 0 if complete else 1
 
 
@@ -78,6 +78,11 @@ def _checked(args: argparse.Namespace) -> str:
         raise ConfigError(
             f"--env {args.env} plays the checkpoints of skills: give --skill, and neither --policy,"
             " --task, --scene nor --record"
+        )
+    if args.workers > 1 or args.ray:
+        raise ConfigError(
+            f"--env {args.env} is played by one {PROGRAM}: give neither --workers nor --ray",
+            hint="-- --eval.batch_size=10 plays ten episodes at the same time",
         )
     if args.max_steps != MAX_STEPS or args.latency_steps is not None or args.real_time:
         raise ConfigError(

@@ -232,6 +232,7 @@ class EpisodeVideo:
         self._arm = env.arm
         self._picture: Any = None
         self._idle_ticks = 0
+        self._reset_tick = 0
 
     @property
     def camera(self) -> str:
@@ -243,11 +244,13 @@ class EpisodeVideo:
     ) -> None:
         """Hand a picture of the stepped world to the recorder."""
         if applied.terminated is None:  # a reset
-            self._picture = None
+            self._picture, self._reset_tick = None, tick_idx
             return
         self._idle_ticks = 0 if skill_active else self._idle_ticks + 1
         closing = applied.terminated or applied.truncated
-        if self.recorder is None or not (closing or tick_idx % VIDEO_EVERY == 0):
+        if self.recorder is None or not (
+            closing or (tick_idx - self._reset_tick) % VIDEO_EVERY == 0
+        ):
             return
         if self._picture is None or self._idle_ticks < STILL_AFTER_TICKS:
             self._picture = self._arm.render(self.camera)

@@ -24,12 +24,11 @@ from typing import TypedDict
 
 from tests.bench.grabs import MANIFEST, benchmark_arguments, grab_sidecar
 from tests.support.paths import ROOT
-from vram_arbiter.runner.cli.benchmark import benchmark_of, entries_of
-from vram_arbiter.runner.sim.benchmark import wilson
+from vram_arbiter.runner.benchmark.entries import entries_of, player_of
+from vram_arbiter.runner.benchmark.outcomes import wilson
 from vram_arbiter.runner.sim.env import SimEnv
 from vram_arbiter.runner.sim.tasks import GRAB
 
-BLOCK = 20  # seeds between two writes
 PUSHED_M = 0.05
 
 
@@ -77,26 +76,23 @@ class Witness:
 
 
 async def play_seed(seeds: Sequence[int], endpoint: str, commit: str, out: Path) -> None:
-    """Play seeds that are missing, and append their lines in blocks."""
+    """Play seeds that are missing, and append a line each."""
     args = benchmark_arguments(endpoint, MANIFEST)
     (entry,) = entries_of(args, None)
     witness = Witness()
     entry = dataclasses.replace(entry, task=dataclasses.replace(GRAB, judge=witness.judge))
-    bench = benchmark_of(entry, args)
-    for first in range(0, len(seeds), BLOCK):
-        witness.episodes, witness.targets = [], []
-        cell = await bench.run(entry.skill(), seeds[first : first + BLOCK])
-        played = zip(cell.episodes, witness.episodes, witness.targets, strict=True)
-        with out.open("a", encoding="utf-8") as sink:
-            for one, kind, target in played:
-                if one.success is None:  # no verdict: the next run plays it again
-                    print(f"seed {one.seed}: {one.message}", file=sys.stderr, flush=True)
-                    continue
-                line: Line = {
-                    "seed": one.seed, "commit": commit, "target": target,
-                    "success": one.success, "steps": one.steps,
-                    "kind": "" if one.success else kind,
-                }  # fmt: skip
+    async with player_of(entry, args) as player:
+        for seed in seeds:
+            one = await player.play(seed)
+            if one.success is None:  # the next run plays it again
+                print(f"seed {seed}: {one.message}", file=sys.stderr, flush=True)
+                continue
+            line: Line = {
+                "seed": seed, "commit": commit, "target": witness.targets[-1],
+                "success": one.success, "steps": one.steps,
+                "kind": "" if one.success else witness.episodes[-1],
+            }  # fmt: skip
+            with out.open("a", encoding="utf-8") as sink:
                 sink.write(json.dumps(line) + "\n")
 
 

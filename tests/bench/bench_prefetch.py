@@ -22,7 +22,7 @@ from pathlib import Path
 import yaml
 
 from tests.bench.grabs import MANIFEST, benchmark_arguments, grab_sidecar
-from vram_arbiter.runner.cli.benchmark import benchmark_of, entries_of
+from vram_arbiter.runner.benchmark.entries import entries_of, player_of
 from vram_arbiter.schemas.plain import JsonObject
 
 HEAD = (
@@ -50,11 +50,17 @@ class Cell:
             manifest.write_text(yaml.safe_dump(raw), encoding="utf-8")
             args = benchmark_arguments(endpoint, manifest, *told)
             (entry,) = entries_of(args, None)
-        cell = asyncio.run(benchmark_of(entry, args).run(entry.skill(), seeds))
-        summary = cell.summary()
-        if summary["errors"] or not cell.complete:
-            raise RuntimeError(f"{self}: {cell.why or cell.episodes[-1].message}")
-        return summary
+        cell = entry.cell()
+
+        async def play() -> None:
+            async with player_of(entry, args) as player:
+                for seed in seeds:
+                    cell.episodes.append(await player.play(seed))
+                    if cell.episodes[-1].success is None:
+                        raise RuntimeError(f"{self}: {cell.episodes[-1].message}")
+
+        asyncio.run(play())
+        return cell.summary()
 
     def row(self, summary: JsonObject) -> str:
         """Return the line of the table."""

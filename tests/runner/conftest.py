@@ -175,6 +175,18 @@ def forked_writers() -> Iterator[None]:
 
 
 @pytest.fixture
+def forked_workers() -> Iterator[None]:
+    """Let benchmarks of this process fork their workers."""
+    from tests.support.benchmark_workers import FORKING
+    from vram_arbiter.runner.benchmark import processes
+
+    warm("vram-runner")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(processes, "subprocess", FORKING)
+        yield
+
+
+@pytest.fixture
 def run_async() -> Callable[[Any], Any]:
     """Runs a coroutine to its end, at most a minute."""
 

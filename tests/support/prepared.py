@@ -119,7 +119,13 @@ PROGRAMS: Mapping[str, Program] = {
             "numpy",
             "vram_arbiter.runner.robots.so101_mujoco",
             "vram_arbiter.runner.sensors.opencv_thread",
-            *(f"vram_arbiter.runner.cli.{name}" for name in ("deploy", "deployment", "sim")),
+            *(
+                f"vram_arbiter.runner.cli.{name}"
+                for name in ("benchmark", "deploy", "deployment", "sim")
+            ),
+            "vram_arbiter.runner.benchmark.player",
+            "vram_arbiter.runner.benchmark.worker",
+            "vram_arbiter.runner.sim.policies",
             "vram_arbiter.runner.sim.env",
         ),
     ),

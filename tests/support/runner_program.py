@@ -1,8 +1,10 @@
-"""`vram-runner` whose recorder forks its writers (`dataset_writer`)."""
+"""`vram-runner` whose recorder forks its writers, and whose benchmark forks its workers."""
 
-from tests.support.dataset_writer import FORKING
+from tests.support import benchmark_workers, dataset_writer
 from vram_arbiter.runner import __main__ as runner
+from vram_arbiter.runner.benchmark import processes
 from vram_arbiter.runner.recording import recorder
 
 main = runner.main
-vars(recorder)["subprocess"] = FORKING
+vars(recorder)["subprocess"] = dataset_writer.FORKING
+vars(processes)["subprocess"] = benchmark_workers.FORKING
