@@ -222,7 +222,7 @@ def answer_queued(core: Core, lease: Lease) -> None:
         return
     request.answered = True
     view = status.view(core, lease)
-    ahead = ahead_of(core.gpus, lease) if view.position and view.position > 1 else ""
+    ahead = ahead_of(core.gpus, lease)
     gpu = core.gpus[request.planned_gpu or request.gpus[0]]
     block = None if ahead else status.block_view(core, gpu)
     core.note(QueuedNote(view.position, request.reason, ahead, block), lease)

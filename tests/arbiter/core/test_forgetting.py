@@ -77,3 +77,17 @@ def test_a_lease_that_is_taken_over_again_and_again_is_known_by_its_last_nonces(
         if known == lease and process == det.process
     ]
     assert len(mine) == NONCES_MAX + 1
+
+
+def test_the_nonce_of_a_debt_found_by_a_restart_is_forgotten_with_it() -> None:
+    driver = CoreDriver(8 * GIB)
+    hung = driver.consumer("hung")
+    lease = hung.acquire(5 * GIB, nonce="n", ttl_s=2.0)
+    driver.until(lambda: driver.state(lease) == "over", limit_s=5.0)
+    driver.restart()
+    core = state_of(driver.arbiter)
+    assert core.nonces[hung.process, "n"] == lease
+    crowd = driver.consumer("crowd")
+    while lease in core.ended:
+        crowd.cancel(crowd.acquire(5 * GIB, wait_timeout_s=1e6))
+    assert (hung.process, "n") not in core.nonces

@@ -45,3 +45,13 @@ def test_who_fills_the_gpu_since_a_moment() -> None:
     four.state = LeaseState.LOADING
     residents.moved(four, LeaseState.HELD)
     assert list(residents.filling(four.ready_at)) == [four]
+
+
+def test_who_was_ready_at_the_very_moment_has_loaded_since_it() -> None:
+    residents, (one, two, three) = crowd(3)
+    for at, lease in enumerate((one, two, three)):
+        lease.granted_at = lease.ready_at = float(at)
+    assert list(residents.loaded_since(two.ready_at)) == [three, two]
+    two.move(LeaseState.REVOKING, 9.0, "asked")
+    residents.moved(two, LeaseState.HELD)
+    assert list(residents.loaded_since(two.ready_at)) == [three, two]

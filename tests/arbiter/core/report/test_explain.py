@@ -8,7 +8,7 @@ from tests.support.core_driver import CoreDriver
 from tests.support.scenes import held, in_use, shown, why
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.events import Asked
-from vram_arbiter.schemas.defaults import GIB, MIB
+from vram_arbiter.schemas.defaults import GIB, MIB, RESERVE_BYTES
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 from vram_arbiter.schemas.wire.requests import Acquire
 
@@ -28,6 +28,7 @@ def test_status_shows_holders_first_then_the_queue_in_order(driver: CoreDriver) 
     assert gpu["charged_bytes"] == 5 * GIB
     assert gpu["stowaway_bytes"] == 100 * MIB
     assert gpu["measured_used_bytes"] == 5 * GIB + 100 * MIB
+    assert [p["charged_bytes"] for p in gpu["processes"] if p["stowaway"]] == [0]
     assert [(p["name"], p["stowaway"], p["lease_ids"]) for p in gpu["processes"]] == [
         ("busy", False, [lease]),
         ("browser", True, []),
@@ -149,6 +150,9 @@ def test_why_behind_others_and_behind_a_load(driver: CoreDriver) -> None:
     driver.consumer("det").acquire(5 * GIB)
     driver.consumer("first").acquire(1 * GIB)
     driver.consumer("second").acquire(1 * GIB)
+    first, second = driver.notes("queued")
+    assert (first["behind"], first["block"]["code"]) == ("", "loading")
+    assert (second["behind"], "block" in second) == ("first", False), "the head's is not its own"
     assert why(driver, "first")["next"] == "waits: det is loading"
     assert [b["text"] for b in why(driver, "first")["blockers"]] == ["is loading"]
     assert why(driver, "second")["next"] == "waits behind first as number 2"
@@ -254,3 +258,11 @@ def test_the_label_of_a_use_is_quoted_safely(driver: CoreDriver) -> None:
     text = why(driver, "vlm")["text"]
     assert 'finish 1 use "look\\x1b[2J"' in text
     assert "\x1b" not in text
+
+
+def test_why_of_a_holder_shows_the_room_of_its_own_gpu() -> None:
+    """It may be on another GPU than the first that it could have had."""
+    driver = CoreDriver(8 * GIB, gpus=2)
+    held(driver, "det", 7)
+    held(driver, "vlm", 3)
+    assert why(driver, "vlm")["free_bytes"] == 5 * GIB - RESERVE_BYTES

@@ -49,6 +49,17 @@ def test_a_process_and_a_user_have_a_share_of_the_queue() -> None:
     answer(other.try_acquire(2 * GIB))
 
 
+def test_whose_share_is_used_up_is_named_only_where_it_is_a_users() -> None:
+    """Nothing noticed a refusal for a user's share that did not say which user's."""
+    driver, _, _ = full()
+    first = driver.consumer("first", uid=7)
+    waiting(first)
+    assert "uid" not in refusal(first.try_acquire(2 * GIB, exclusive=True)).details
+    second = driver.consumer("second", uid=7)
+    waiting(second)
+    assert refusal(second.try_acquire(2 * GIB, exclusive=True)).details["uid"] == 7
+
+
 def test_the_last_places_are_for_requests_above_the_default_priority() -> None:
     driver, _, _ = full()
     for uid in (7, 8):

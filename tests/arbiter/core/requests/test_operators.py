@@ -1,13 +1,16 @@
 """What an operator does by hand: it is kept with who and why, and no rule for holders gets
 weaker."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.engine_state import state_of
 from tests.support.scenes import give_back, held, in_use, shown
 from vram_arbiter.arbiter.core.effects import Effect, Note, Signal
+from vram_arbiter.arbiter.core.events import SettingsChanged
 from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
@@ -64,7 +67,7 @@ def test_evicting_twice_asks_once(driver: CoreDriver, ops: Consumer) -> None:
     _, lease = held(driver, "det", 5)
     order_of(ops, "evict", lease)
     effects = order_of(ops, "evict", lease)
-    assert noted(effects)["repeated"] is True
+    assert (noted(effects)["repeated"], noted(effects)["lease_id"]) == (True, lease)
     assert len(driver.notes("revoke_asked")) == 1
 
 
@@ -218,7 +221,9 @@ def test_a_drained_arbiter_grants_nothing_and_keeps_what_is_held(
     driver: CoreDriver, ops: Consumer
 ) -> None:
     _, lease = held(driver, "det", 3)
-    assert answer(order_of(ops, "drain", reason="new driver"))["drained"] == f"{BY}: new driver"
+    effects = order_of(ops, "drain", reason="new driver")
+    assert answer(effects)["drained"] == f"{BY}: new driver"
+    assert noted(effects)["action"] == "drain"
     waiting = driver.consumer("vlm").acquire(1 * GIB)
     driver.advance(20.0)
     assert (driver.state(lease), driver.state(waiting)) == ("held", "queued")
@@ -259,6 +264,7 @@ def test_the_lease_of_a_silent_holder_is_given_up_and_its_bytes_measured(
     driver.advance(450.0)
     assert answer(order_of(ops, "release_dead", lease, "hangs since noon"))["state"] == "expired"
     assert driver.notes("operator")[-1]["action"] == "release_dead"
+    assert driver.notes("expired")[-1]["why"] == "given_up"
     (lost,) = driver.pushes("lost", lease)
     assert lost["error"]["code"] == "lease_expired"
     assert lost["error"]["details"]["order"] == {"by": BY, "reason": "hangs since noon"}
@@ -409,3 +415,8 @@ def test_what_holds_nothing_is_not_killed(driver: CoreDriver, ops: Consumer) -> 
     held(driver, "det", 5, evictable=False)
     driver.consumer("waits").acquire(5 * GIB)
     assert refusal(order_of(ops, "kill", "waits")).details["problem"] == "not_held"
+
+
+def test_a_changed_setting_leaves_the_others_as_they_are(driver: CoreDriver) -> None:
+    driver.post(SettingsChanged({"waiters_max": 3}))
+    assert state_of(driver.arbiter).settings == replace(driver.settings, waiters_max=3)

@@ -4,7 +4,7 @@ from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.scenes import give_back, held
 from vram_arbiter.arbiter.core.effects import Note, Push, Refuse
 from vram_arbiter.arbiter.core.events import ClientConnected, ClientLeft, JournalFailed, ProcessDied
-from vram_arbiter.schemas.defaults import GIB
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
 
 
@@ -261,3 +261,12 @@ def test_a_connection_that_says_hello_as_another_instance_is_only_that(driver: C
     back = ClientId("back")
     driver.post(ClientConnected(back, det.process, 1000, "det", "det-c101"))
     assert driver.status()["clients"] == 2, "nobody was taken over"
+
+
+def test_whoever_says_bye_and_lives_on_keeps_its_context(driver: CoreDriver) -> None:
+    """The process did not exit: measuring its context away would take for ever."""
+    det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
+    det.hold(450 * MIB)
+    det.leave()
+    driver.until(lambda: driver.state(lease) == "over", limit_s=1.0)
+    assert driver.gpu()["charged_bytes"] == 450 * MIB

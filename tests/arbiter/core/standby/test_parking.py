@@ -98,7 +98,8 @@ def test_without_room_the_revoke_says_so(budget_gib: int) -> None:
 def test_who_declared_nothing_cannot_park_and_who_exits_keeps_nothing() -> None:
     driver = driver_with()
     person, lease = held(driver, "plain", 2)
-    assert refusal(person.release(lease, parked=True)).code == "bad_state"
+    undeclared = refusal(person.release(lease, parked=True))
+    assert (undeclared.code, "park_bytes" in undeclared.message) == ("bad_state", True)
     other, second = held(driver, "other", 2, park_bytes=2 * GIB)
     assert refusal(other.release(second, parked=True, exiting=True)).code == "bad_state"
     assert driver.state(lease) == driver.state(second) == "held"
@@ -302,3 +303,17 @@ def test_a_lost_journal_does_not_lose_it(standby: bool) -> None:
     policy.unload(wanted)
     driver.advance(5.0)
     assert driver.state(lease) == ("loading" if standby else "parked")
+
+
+def test_a_holder_that_parked_unasked_while_the_daemon_was_away_has_its_ram_counted() -> None:
+    """Nobody had asked it to leave, so no room in RAM was booked for it before the restart."""
+    driver = driver_with()
+    vlm, lease = held(driver, "vlm", 5, park_bytes=5 * GIB, residue_bytes=RESIDUE)
+    token = vlm.token(lease)
+    vlm.hold(RESIDUE)
+    driver.restart()
+    assert ram(driver) == 0
+    vlm.connect()
+    vlm.reattach(lease, token, parked=True)
+    assert ram(driver) == 5 * GIB
+    driver.until(lambda: driver.state(lease) == "parked")
