@@ -62,20 +62,19 @@ type _Row = tuple[str, object, _Convert | None]
 
 @cache
 def _encoder(cls: Any) -> Callable[[Any], JsonObject]:
-    """Return what encodes a class. Its table is filled with its first value, so that a class may
-    hold its own kind."""
+    """Return what encodes a class. Its table is made with its first value, so that a class may hold
+    its own kind."""
     if not is_dataclass(cls):
         raise TypeError(f"{cls.__name__} is not a dataclass and has no plain form")
     names, tag = [field.name for field in fields(cls)], getattr(cls, "TAG", None)
     always = {tag[0]: tag[1]} if tag else {}
     # of one attribute it would return that, of none nothing
     values_of = attrgetter(*names, "__class__", "__class__")
-    table: list[_Row] = []
+    table = cache(partial(_encoded_fields, cls))
 
     def encode(value: Any) -> JsonObject:
         encoded: JsonObject = always.copy()
-        rows = table or _fill(table, cls)
-        for (key, default, convert), item in zip(rows, values_of(value), strict=False):
+        for (key, default, convert), item in zip(table(), values_of(value), strict=False):
             if item is not default and (default is MISSING or item != default):
                 encoded[key] = item if convert is None else convert(item)
         return encoded
@@ -83,8 +82,8 @@ def _encoder(cls: Any) -> Callable[[Any], JsonObject]:
     return encode
 
 
-def _fill(table: list[_Row], cls: Any) -> list[_Row]:
-    """Fill the table of an encoder, at once: another thread may use it."""
+def _encoded_fields(cls: Any) -> list[_Row]:
+    """Return the table of an encoder."""
     hints, rows, whole = get_type_hints(cls), [], getattr(cls, "WHOLE", False)
     for field in fields(cls):
         part = field.metadata.get("part")
@@ -92,8 +91,7 @@ def _fill(table: list[_Row], cls: Any) -> list[_Row]:
         default = MISSING if whole else made if field.default is MISSING else field.default
         convert = attrgetter(part) if part else _encoding(hints[field.name])
         rows.append((part or field.name, default, convert))
-    table[:] = rows
-    return table
+    return rows
 
 
 def _encoding(hint: Any) -> _Convert | None:
@@ -136,17 +134,17 @@ def _any_plain(value: Any) -> Any:
 # -- maps → values
 @cache
 def _decoder(cls: Any, strict: bool) -> _Convert:
-    """Return what decodes a class. Its table is filled with its first value."""
+    """Return what decodes a class. Its table is made with its first value."""
     make: Callable[..., Any] = cls
     if not is_dataclass(cls):
         raise CodecError(f"{cls} has no plain form")
-    table: list[tuple[str, _Convert | None, bool]] = []
+    table = cache(partial(_decoded_fields, cls, strict))
 
     def decode(data: Any) -> Any:
         if strict or type(data) is not dict:
             _check(cls, data, strict)
         values = {}
-        for key, convert, required in table or _rows(table, cls, strict):
+        for key, convert, required in table():
             item = data.get(key, MISSING)
             if item is not MISSING:
                 values[key] = item if convert is None else convert(item)
@@ -157,16 +155,13 @@ def _decoder(cls: Any, strict: bool) -> _Convert:
     return decode
 
 
-def _rows(
-    table: list[tuple[str, _Convert | None, bool]], cls: Any, strict: bool
-) -> list[tuple[str, _Convert | None, bool]]:
-    """Fill the table of a decoder, at once: key, conversion, and whether a map must have it."""
+def _decoded_fields(cls: Any, strict: bool) -> list[tuple[str, _Convert | None, bool]]:
+    """Return the table of a decoder: key, conversion, and whether a map must have it."""
     hints = get_type_hints(cls)
-    table[:] = [
+    return [
         (field.name, _decoding(hints[field.name], strict), _is_required(field))
         for field in fields(cls)
     ]
-    return table
 
 
 def _decoding(hint: Any, strict: bool) -> _Convert | None:

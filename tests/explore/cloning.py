@@ -1,9 +1,10 @@
 """Copies of a world, thousands a second.
 
 A copy is a pickle in which whatever never changes (frozen records, named tuples, enumerations,
-code) is a reference to the one object that all copies share. Closures, which the client's protocol
-keeps for its replies, travel as their code and their cells, so that a copy's closures speak of the
-copy.
+code) is a reference to the one object that all copies share. What most worlds have of it, with the
+classes and the names of their fields, is in the memo of each pickle before it begins (`_Words`).
+Closures, which the client's protocol keeps for its replies, travel as their code and their cells,
+so that a copy's closures speak of the copy.
 """
 
 import importlib
@@ -13,43 +14,86 @@ import pickle
 from collections.abc import Callable
 from enum import Enum
 from functools import cache
+from operator import getitem
 from types import CellType, CodeType, FunctionType
 from typing import Any
 
-type Frozen = tuple[bytes, list[object]]
-"""The pickle of a world, and the objects that it refers to."""
+type Frozen = tuple[bytes, list[object], _Words]
+"""The pickle of a world, the objects that it refers to, and the words that it is written in."""
 
 _shared: list[object] = []
 """Those of the copy that is made or read at the moment."""
 
 
-def freeze(world: object) -> Frozen:
-    """Return a copy that `thaw` brings to life, any number of times."""
-    shared: list[object] = []
-    buffer = io.BytesIO()
-    _Pickler(buffer, shared).dump(world)
-    return buffer.getvalue(), shared
+class _Words:
+    """Objects that a pickle refers to without naming them. A pickle is read with the words that it
+    was written in: the numbers in it begin after them."""
+
+    def __init__(self, words: list[object]) -> None:
+        self.words = words
+        self.written, self.read = pickle.Pickler(io.BytesIO()), _Reader(io.BytesIO(_primer(words)))
+        self.written.memo = {id(word): (n, word) for n, word in enumerate(words)}
+        self.read.words = words
+        self.read.load()
+
+    def with_those_of(self, pickler: pickle.Pickler) -> "_Words":
+        """Return these words and those that a pickle had to add."""
+        met = sorted(pickler.memo.copy().values(), key=lambda entry: entry[0])
+        return _Words(
+            self.words + [thing for n, thing in met[len(self.words) :] if _is_word(thing)]
+        )
+
+
+class _Reader(pickle.Unpickler):
+    words: list[object]
+
+    def persistent_load(self, n: int) -> object:
+        return self.words[n]
+
+
+def _primer(words: list[object]) -> bytes:
+    """Return a pickle that puts words into a reader's memo: a dictionary is not taken there."""
+    numbers = [n.to_bytes(4, "little") for n in range(len(words))]
+    puts = [pickle.BININT + n + pickle.BINPERSID + pickle.LONG_BINPUT + n for n in numbers]
+    return pickle.POP.join(puts) + pickle.STOP
+
+
+class Freezer:
+    """Makes copies, with words that it learns from the worlds that it meets."""
+
+    def __init__(self) -> None:
+        self._words = _Words([_shared, getitem])
+        self._count = 0
+
+    def freeze(self, world: object) -> Frozen:
+        """Return a copy that `thaw` brings to life, any number of times."""
+        _shared.clear()
+        buffer = io.BytesIO()
+        pickler, words = _Pickler(buffer, 3), self._words
+        pickler.memo = words.written.memo
+        pickler.dump(world)
+        data = buffer.getvalue()
+        frame = pickle.FRAME + len(data).to_bytes(8, "little")  # read at once
+        frozen = frame + data, _shared.copy(), words
+        self._count += 1
+        if self._count & (self._count - 1) == 0:  # ever more rarely
+            self._words = words.with_those_of(pickler)
+        return frozen
 
 
 def thaw(frozen: Frozen) -> Any:
     """Return a fresh copy of what was frozen."""
-    global _shared
-    data, _shared = frozen
-    return pickle.loads(data)
+    data, _shared[:], words = frozen
+    unpickler = pickle.Unpickler(io.BytesIO(data))
+    unpickler.memo = words.read.memo
+    return unpickler.load()
 
 
 class _Pickler(pickle.Pickler):
-    def __init__(self, buffer: io.BytesIO, shared: list[object]) -> None:
-        super().__init__(buffer, 5)
-        self._shared = shared
-
     def reducer_override(self, value: Any) -> Any:
         kind: type = type(value)
         reduce = _reducer(kind)
-        if reduce is not _refer:
-            return NotImplemented if reduce is None else reduce(value)
-        self._shared.append(value)
-        return _referred, (len(self._shared) - 1,)
+        return NotImplemented if reduce is None else reduce(value)
 
 
 @cache
@@ -61,13 +105,15 @@ def _reducer(kind: type) -> Callable[[Any], Any] | None:
     return _OTHERS.get(kind)
 
 
-def _refer(value: object) -> object:
-    """Stands for: all copies share it."""
-    return value
+def _refer(value: object) -> Any:
+    """All copies share it."""
+    _shared.append(value)
+    return getitem, (_shared, len(_shared) - 1)
 
 
-def _referred(index: int) -> object:
-    return _shared[index]
+def _is_word(thing: object) -> bool:
+    kind: type = type(thing)
+    return isinstance(thing, str | type) or (_reducer(kind) is _refer and kind is not tuple)
 
 
 # -- what pickle cannot do by itself

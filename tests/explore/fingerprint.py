@@ -52,7 +52,7 @@ _LEFT_OUT_BECAUSE: Mapping[str, str] = {
 }
 LEFT_OUT = frozenset(name for names in _LEFT_OUT_BECAUSE.values() for name in names.split())
 """Fields of any record by name."""
-_PLAIN = frozenset({int, bool, float, NoneType})
+_PLAIN = frozenset({int, bool, NoneType})
 _NOISE = frozenset({"seq", "epoch", "message", "hint", "details", "instance", "nonce", "pid"})
 """Of messages."""
 type Names = dict[object, int]
@@ -87,23 +87,27 @@ def _rank(core: Core, client: Client) -> tuple[object, ...]:
 
 # -- writing
 class _Part:
-    """Values in one row. Names are shared by the parts of a world."""
+    """Values in one row, and where in it moments are. Names are shared by the parts of a world."""
 
     def __init__(self, names: Names) -> None:
         self.names = names
         self.row: list[Any] = []
+        self.moments: list[int] = []
 
     def put(self, *values: Any) -> None:
-        append, names = self.row.append, self.names
+        row, names = self.row, self.names
         for value in values:
             kind = type(value)
             if kind in _PLAIN:
-                append(value)
+                row.append(value)
+            elif kind is float:
+                self.moments.append(len(row))
+                row.append(value)
             elif kind is str:
                 named = names.get(value)
                 if named is None and value[:1] == "L" and value[1:2].isdigit():
                     named = self.name(value)  # a lease
-                append(value if named is None else named)
+                row.append(value if named is None else named)
             else:
                 _WRITERS[kind](self, value)
 
@@ -111,12 +115,15 @@ class _Part:
         """Return the number of what has a name of its own; a new one where it has none yet."""
         return self.names.setdefault(thing, len(self.names) + 1)
 
-    def sealed(self, now: float) -> tuple[Any, ...]:
+    def sealed(self, now: float) -> list[Any]:
         """Return the row, with moments as their places: below zero those that are over."""
-        moments = sorted({value for value in self.row if type(value) is float})  # 0.0: never
+        row = self.row
+        moments = sorted({row[place] for place in self.moments})  # 0.0: never
         far, over = bisect(moments, now + FAR_S), bisect(moments, now)
         places = {at: f"{n - over}" if n < far else "far" for n, at in enumerate(moments)}
-        return tuple([places[value] if type(value) is float else value for value in self.row])
+        for place in self.moments:
+            row[place] = places[row[place]]
+        return row
 
 
 type _Writer = Callable[[_Part, Any], None]
@@ -140,9 +147,7 @@ def _writer(kind: type) -> _Writer:
     if kind is LeaseSpec:
         return lambda part, value: part.row.append(value.consumer)
     if issubclass(kind, dict):
-        return lambda part, table: part.put(
-            len(table), *[x for key in _sorted(part, table) for x in (key, table[key])]
-        )
+        return _write_table
     if issubclass(kind, set | frozenset):
         return lambda part, some: part.put(len(some), *_sorted(part, some))
     if issubclass(kind, list | tuple | deque):
@@ -150,8 +155,14 @@ def _writer(kind: type) -> _Writer:
     return _record_writer()
 
 
-def _sorted(part: _Part, keys: Any) -> list[Any]:
-    return sorted(keys, key=lambda key: str(part.names.get(key, key))) if len(keys) > 1 else [*keys]
+def _write_table(part: _Part, table: dict[Any, Any]) -> None:
+    part.row.append(len(table))
+    for key in _sorted(part, table):
+        part.put(key, table[key])
+
+
+def _sorted(part: _Part, keys: Any) -> Any:
+    return sorted(keys, key=lambda key: str(part.names.get(key, key))) if len(keys) > 1 else keys
 
 
 def _record_writer() -> _Writer:
@@ -160,9 +171,8 @@ def _record_writer() -> _Writer:
     def write(part: _Part, value: Any) -> None:
         if not getters:
             every = [one.name for one in fields(value)] if is_dataclass(value) else vars(value)
-            names = [name for name in every if name not in LEFT_OUT]
-            getters.append(attrgetter(*names, *names[:1]) if names else lambda _: ())
-        part.put(*getters[0](value))
+            getters.extend(attrgetter(name) for name in every if name not in LEFT_OUT)
+        part.put(*[get(value) for get in getters])
 
     return write
 

@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
-from tests.explore.cloning import Frozen, freeze, thaw
+from tests.explore.cloning import Freezer, Frozen, thaw
 from tests.explore.fingerprint import fingerprint
 from tests.explore.world import Action, Scenario, World
 
@@ -27,8 +27,9 @@ SERVE: Final = (
 SERVE_STEPS_MAX = 400
 SERVE_SHARE = 0.1
 """Of the time of a search that is cut: for serving those that wait at its edge."""
-COLLECT_EVERY = 4000
-"""States between two collections of garbage: worlds hold circles."""
+COLLECT_EVERY = 20
+"""States between two collections of garbage: worlds hold circles, and memory that was used just now is
+fast."""
 
 
 @dataclass(slots=True)
@@ -96,6 +97,7 @@ class Search:
     def __init__(self, scenario: Scenario) -> None:
         self.report = Report(scenario.name)
         self._scenario = scenario
+        self._freezer = Freezer()
         self._known: dict[int, int] = {}
         self._parents, self._steps = array("I"), array("H")
         self._actions: dict[Action, int] = {}  # by which number they are steps
@@ -121,7 +123,7 @@ class Search:
         """Explore layer by layer. Return the states that are met and not explored."""
         report, world = self.report, World(self._scenario)
         self._meet(world, 0, ("start", ""))
-        layer, following = [(0, freeze(world))], list[tuple[int, Frozen]]()
+        layer, following = [(0, self._freezer.freeze(world))], list[tuple[int, Frozen]]()
         while layer:
             for place, (state, frozen) in enumerate(layer):
                 if time.perf_counter() > until or len(self._parents) >= states_max or report.error:
@@ -147,7 +149,7 @@ class Search:
             report.verbs[action[0]] = report.verbs.get(action[0], 0) + 1
             met, is_new = self._meet(world, state, action)
             if is_new:
-                following.append((met, freeze(world)))
+                following.append((met, self._freezer.freeze(world)))
             else:
                 report.merged += 1
             if action[0] in SERVE and met != state:

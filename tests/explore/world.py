@@ -192,6 +192,7 @@ class World:
         else:
             getattr(self, f"do_{verb}")(*whose.split())
         self._deliver(mail=not self.scenario.talks, readings=self.scenario.talks)
+        check_arbiter(self.engine)
         self._check(state_of(self.engine))
 
     def _deliver(self, *, mail: bool, readings: bool) -> None:
@@ -211,7 +212,6 @@ class World:
         """Hand an event to the engine and perform what it asks, as the executor does."""
         self.now += STEP_S
         effects = self.engine.handle(event, self.now)
-        check_arbiter(self.engine)
         for effect in effects:
             match effect:
                 case fx.JournalPut(key, record, gates):

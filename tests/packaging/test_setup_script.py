@@ -159,18 +159,26 @@ def test_without_gstreamer_everything_else_is_installed_and_what_is_missing_is_s
     assert result.returncode == 0, result.stderr
     assert "cameras through GStreamer are left out" in result.stderr
     assert "sudo apt-get install gcc libc6-dev pkg-config libgirepository1.0-dev" in result.stderr
-    assert installed(full) == ["all"]
+    assert installed(full) == ["all ray"]
     assert "apt-get" not in (full / "log").read_text(encoding="utf-8"), "only root may"
+
+
+def test_the_product_is_compiled_where_python_writes_no_bytecode(full: Path) -> None:
+    module = full / "src/vram_arbiter/arbiter/daemon.py"
+    module.parent.mkdir(parents=True)
+    module.touch()
+    assert set_up(full, "full", PYTHONDONTWRITEBYTECODE="1").returncode == 0
+    assert list(module.parent.glob("__pycache__/daemon.*.pyc"))
 
 
 def test_libraries_that_came_later_are_a_reason_to_begin_again(full: Path) -> None:
     assert set_up(full, "full").returncode == 0
     assert set_up(full, "full").returncode == 0
-    assert installed(full) == ["all"]
+    assert installed(full) == ["all ray"]
     (full / "headers").touch()
     result = set_up(full, "full")
     assert result.returncode == 0, result.stderr
-    assert installed(full) == ["all", "all gstreamer"]
+    assert installed(full) == ["all ray", "all ray gstreamer"]
     assert set_up(full, "full").returncode == 0
     assert len(installed(full)) == 2
 
@@ -189,7 +197,7 @@ def test_root_gets_the_libraries_by_apt(full: Path) -> None:
     assert first == "apt-get update -qq"
     assert second.startswith("apt-get install -y -qq")
     assert "gstreamer1.0-plugins-good" in second
-    assert installed(full) == ["all gstreamer"]
+    assert installed(full) == ["all ray gstreamer"]
 
 
 @pytest.mark.parametrize("trouble", ["offline", "unbuildable"])
@@ -201,4 +209,4 @@ def test_trouble_with_gstreamer_stops_nothing_else(full: Path, trouble: str) -> 
         pytest.skip("this machine lacks EGL, too, and that is wanted")
     assert result.returncode == 0, result.stderr
     assert "cameras through GStreamer are left out" in result.stderr
-    assert installed(full)[-1] == "all"
+    assert installed(full)[-1] == "all ray"
