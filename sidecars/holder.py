@@ -13,14 +13,13 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.errors import ModelError, VramError
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.sidecars.device.fake import FakeMemory
 from vram_arbiter.sidecars.device.memory import Block, DeviceMemory, fill
+from vram_arbiter.sidecars.device.open import open_memory
 from vram_arbiter.sidecars.host_weights import HostWeights
 from vram_arbiter.sidecars.parent import end_with
 
@@ -42,7 +41,7 @@ class Holder:
 
     def begin(self, device: str) -> JsonMap:
         """Open the device: the first request, by the program's argument. Raises NoGpu."""
-        self._memory = _open(device)
+        self._memory = open_memory(device, "selftest")
         return {"pid": os.getpid()}
 
     def fill(self, size_bytes: int) -> JsonMap:
@@ -71,21 +70,25 @@ class Holder:
         return {"sum": int(self._numbers.sum())}
 
     def copies(self, size_bytes: int) -> JsonMap:
-        """Time copies of weights from host RAM, in a process that is forked as a model's is: the
-        weights lie in memory that both share (`host_weights`). The first request, if at all: a
-        context does not survive the fork."""
+        """Time copies of weights from host RAM, in a process that is forked as a model's is, from
+        memory that both share (`host_weights`). The first request, if at all: a context does not
+        survive the fork, which serves in this process's place."""
         import torch
 
         torch.set_num_threads(1)  # a fork copies no other thread
         pieces = [torch.ones(PIECE_BYTES // 4) for _ in range(size_bytes // PIECE_BYTES)]
         network = torch.nn.ParameterList(pieces).requires_grad_(False)
         weights = HostWeights([network], "selftest")
-        return _forked(lambda: self._timed_copies(network, weights))
+        parent = os.getpid()
+        if os.fork():
+            os._exit(os.waitstatus_to_exitcode(os.wait()[1]))
+        end_with(parent)
+        return self._timed_copies(network, weights)
 
     def _timed_copies(self, network: Any, weights: HostWeights) -> JsonMap:
-        """Seconds of the first copy of a sidecar's weights, and medians of plain copies, each one
-        `cudaMemcpyAsync` of all bytes and a synchronization: from ordinary and from page-locked
-        memory."""
+        """Return seconds of the first copy of a sidecar's weights, and medians of plain copies,
+        each one `cudaMemcpyAsync` of all bytes and a synchronization: from ordinary and from
+        page-locked memory."""
         import torch
 
         self._memory.touch()
@@ -137,37 +140,8 @@ class Holder:
         return {"bytes": _size(network), "of_bytes": before, "difference": difference}
 
 
-def _open(device: str) -> DeviceMemory:
-    if device.startswith("fake:"):
-        return FakeMemory(Path(device.removeprefix("fake:")), "selftest")
-    if device == "none":
-        return DeviceMemory()
-    from vram_arbiter.sidecars.device.cuda import CudaMemory
-
-    index = device.partition(":")[2]
-    return CudaMemory(int(index) if index else None)
-
-
 def _size(network: Any) -> int:
     return sum(one.numel() * one.element_size() for one in network.parameters())
-
-
-def _forked(work: Callable[[], JsonMap]) -> JsonMap:
-    """Do the work in a fork of this process. Raises ModelError where it ends without an answer."""
-    read, write = os.pipe()
-    parent = os.getpid()
-    if os.fork() == 0:
-        end_with(parent)
-        os.write(write, json.dumps(_answer(work)).encode())
-        os._exit(0)
-    os.close(write)
-    with os.fdopen(read) as pipe:
-        told = pipe.read()
-    _, status = os.wait()
-    if not told:
-        raise ModelError(f"the fork ended with {os.waitstatus_to_exitcode(status)}")
-    found: JsonMap = json.loads(told)
-    return found
 
 
 def _answer(work: Callable[[], JsonMap]) -> JsonMap:

@@ -159,7 +159,7 @@ class _Model:
     def perform(self, message: Message) -> Message:
         match message["do"]:
             case "check":
-                open_memory(self._settings)
+                self._opened()
             case "load":
                 return {"used_bytes": self._load(message["gpu"])}
             case "run":
@@ -172,11 +172,15 @@ class _Model:
         if self._memory is not None:
             self._memory.close()
 
+    def _opened(self) -> DeviceMemory:
+        wanted = self._settings
+        return open_memory(wanted.device, wanted.name, wanted.footprint.residue_bytes)
+
     def _load(self, gpu: str) -> int | None:
         """Copy the weights onto the device, then ballast up to the footprint where they stand for a
         larger model. Return the bytes on the GPU."""
         settings, footprint = self._settings, self._settings.footprint
-        memory = self._memory = open_memory(settings)
+        memory = self._memory = self._opened()
         if gpu:
             memory.bind(gpu)
         memory.touch()

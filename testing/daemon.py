@@ -1,6 +1,7 @@
 """A private daemon: `python -m vram_arbiter.arbiter` in a folder of its own, started until READY,
 ended by its pid."""
 
+import fcntl
 import os
 import select
 import shutil
@@ -25,7 +26,7 @@ FOREIGN: Final = ("VRAM_ARBITER_", "WATCHDOG_", "OTEL_")
 
 class ArbiterProcess:
     """One runtime folder with at most one daemon in it at a time; it can be killed and started
-    again on the same state.
+    again on the same state. A daemon dies with the process that started it.
 
     The folder `runtime` is short (a socket path holds 107 bytes) and holds `arbiter.sock`,
     `state/`, `arbiter.log` and the simulated GPU `fakegpu/` (`gpu_folder`; of several the first).
@@ -49,6 +50,7 @@ class ArbiterProcess:
         self.process: subprocess.Popen[bytes] | None = None
         self.messages: list[str] = []
         self.program = list(PROGRAM)
+        self._stdin, self._held = socket.socketpair()
         self._notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._notify.bind(str(self.runtime / "notify.sock"))
 
@@ -79,9 +81,16 @@ class ArbiterProcess:
         return self.process
 
     def _launch(self, environ: Mapping[str, str], log: IO[bytes]) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(
-            self.command(), env=environ, stdout=log, stderr=log, stdin=subprocess.DEVNULL
+        """Start the program. The kernel kills it when the other end of its standard input
+        closes (fcntl(2), F_SETSIG), however this process ends; a parent-death signal would come
+        with the end of the thread that started it."""
+        process = subprocess.Popen(
+            self.command(), env=environ, stdout=log, stderr=log, stdin=self._stdin.fileno()
         )
+        fcntl.fcntl(self._stdin, fcntl.F_SETOWN, process.pid)
+        fcntl.fcntl(self._stdin, fcntl.F_SETSIG, signal.SIGKILL)
+        fcntl.fcntl(self._stdin, fcntl.F_SETFL, fcntl.FASYNC)
+        return process
 
     def start(self, extra_environ: Mapping[str, str] | None = None) -> Self:
         """Start the daemon and wait until it says READY. Raises RuntimeError with its log if it
@@ -132,7 +141,8 @@ class ArbiterProcess:
         """End the daemon if it runs and remove the folder."""
         if self.process is not None and self.process.poll() is None:
             self.kill()
-        self._notify.close()
+        for end in (self._notify, self._stdin, self._held):
+            end.close()
         eventually(self._removed)
 
     def _removed(self) -> bool:

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
 async def _run(args: argparse.Namespace) -> list[Result]:
     index, why = await _index(args.gpu)
-    simulated, gpus = index is None, list[Gpu]()
+    simulated, gpus, results = index is None, list[Gpu](), list[Result]()
 
     def begun(gpu: Gpu) -> None:
         gpus.append(gpu)
@@ -69,11 +69,12 @@ async def _run(args: argparse.Namespace) -> list[Result]:
             print(printable(f"{report.SIMULATED} ({why})"), flush=True)
 
     def tell(result: Result) -> None:
+        results.append(result)
         line = report.line_of(result, simulated=simulated)
         print("\n".join(terminal.folded(line, 4, terminal.columns())), flush=True)
 
     rows = [row for row in ROWS if args.row is None or row.id in args.row]
-    results = await selftest(Order(index, args.memory, args.within, rows), begun, tell)
+    await selftest(Order(index, args.memory, args.within, rows), begun, tell)
     told = report.told(gpus[0], results, simulated=simulated)
     print(told["summary"])
     for place, written in ((args.json, report.as_json), (args.report, report.as_markdown)):

@@ -9,7 +9,7 @@ import os
 import sys
 import time
 from asyncio.subprocess import PIPE, Process
-from collections.abc import AsyncIterator, Callable, Collection, Mapping
+from collections.abc import AsyncIterator, Callable, Collection
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -160,13 +160,13 @@ class Bed:
 
     @asynccontextmanager
     async def holder(
-        self, lease: str = "", environ: Mapping[str, str] | None = None
+        self, lease: str = "", size_bytes: int | None = None, **environ: str
     ) -> AsyncIterator[Holder]:
-        """Start a process that can hold bytes, and end it again: under a lease of that name
-        (`vramctl run`), or without one, which makes it a stowaway. Its bytes are back at the end of
-        the block.
+        """Start a process that holds a context and so many bytes (None: neither), and end it again:
+        under a lease of that name (`vramctl run`), or without one, which makes it a stowaway. Its
+        bytes are back at the end of the block.
 
-        Raises Skipped, Missed, SidecarUnavailable.
+        Raises Skipped, Missed, SidecarUnavailable, and the process's errors.
         """
         if not self.simulated:
             need("torch", extra="sidecars")
@@ -178,11 +178,13 @@ class Bed:
         with path.open("wb") as log:
             process = await asyncio.create_subprocess_exec(
                 *command, stdin=PIPE, stdout=PIPE, stderr=log, preexec_fn=dying_with_parent(),
-                env=dict(os.environ) | dict(self.programs.environ) | dict(environ or {}),
+                env=dict(os.environ) | dict(self.programs.environ) | environ,
             )  # fmt: skip
         made = Holder(process, path)
         try:
             made.pid = (await made.answer())["pid"]
+            if size_bytes is not None:
+                await made.ask("fill", size_bytes)
             yield made
         finally:
             await made.end()
@@ -195,7 +197,7 @@ class Bed:
 
         Raises Skipped, Missed, SidecarUnavailable, and the sidecar's errors.
         """
-        need("torch", "transformers", "lerobot", "PIL", extra="sidecars")
+        need("torch", "transformers", "lerobot", extra="sidecars")
         manifest = load_manifest(configs_folder(os.environ) / "rskills" / skill / "rskill.yaml")
         for name in sorted(set(self.skills) - set(self.programs.running)):
             await self.programs.start(

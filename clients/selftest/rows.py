@@ -2,18 +2,18 @@
 its limit and the source of that."""
 
 import asyncio
-import io
 import math
 import os
 import statistics
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from vram_arbiter.clients.calibration.model import ASKED
+from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.foreign.actions import Action
 from vram_arbiter.clients.foreign.cuda_checkpoint import CheckpointAction, CudaDriver
 from vram_arbiter.clients.foreign.program import is_below
@@ -33,12 +33,8 @@ DETECTOR, VLM, POLICY = "so101-detector", "so101-scene-vlm", "so101-grab"
 READINGS: Final = 20
 ASKING_S: Final = 1.0
 """How long a request waits beside a stowaway: several readings."""
-CUBE: Final = (
-    (((300, 230), (340, 230), (340, 270), (300, 270)), "#c81e1e"),
-    (((300, 230), (313, 217), (353, 217), (340, 230)), "#ff3838"),
-    (((340, 230), (353, 217), (353, 257), (340, 270)), "#8c1515"),
-)
-"""Its front, top and side: corners in pixels, and color."""
+CUBE: Final = "diagnostics/cube.png"
+"""A red cube on a table, drawn: of the configs."""
 CUBE_PX, CUBE_SIDE_PX = (326, 243), 40
 BEAT_S: Final = 0.05
 CHECKPOINT_S: Final = 20.0
@@ -97,13 +93,16 @@ def row(unit: str, **fields: Any) -> Callable[[Measure], Measure]:
 @row("ms", source="probe.load_s", most=d.LOAD_PROBE_S * 1000)
 async def reading(bed: Bed) -> Found:
     """Measure the median time of a reading."""
-    times = []
-    for _ in range(READINGS):
-        began_s = time.perf_counter()
-        listed = (await bed.read()).processes
-        times.append((time.perf_counter() - began_s) * 1000)
-    named = "bytes by process are listed" if listed is not None else "no bytes by process"
-    return statistics.median(times), named
+    taken = [await _timed(bed.read()) for _ in range(READINGS)]
+    listed = taken[-1][0].processes is not None
+    named = "bytes by process are listed" if listed else "no bytes by process"
+    return statistics.median(ms for _, ms in taken), named
+
+
+async def _timed[T](work: Awaitable[T]) -> tuple[T, float]:
+    """Return what the work returns, and its time in ms."""
+    began_s = time.perf_counter()
+    return await work, (time.perf_counter() - began_s) * 1000
 
 
 @row("MiB", source="limits.md: 0.1 to 0.6 GB", most=572)
@@ -121,8 +120,7 @@ async def context(bed: Bed) -> Found:
 @row("ms", **VERIFY)
 async def lag_free(bed: Bed) -> Found:
     """Measure the time from a free to a reading that shows it."""
-    async with bed.holder() as holder:
-        await holder.ask("fill", 0)
+    async with bed.holder(size_bytes=0) as holder:
         empty = await bed.used()
         await holder.ask("fill", bed.part_bytes)
         shown = await bed.used() - empty
@@ -136,8 +134,7 @@ async def lag_free(bed: Bed) -> Found:
 async def lag_exit(bed: Bed) -> Found:
     """Measure the time from a process's end to a reading that shows it."""
     before = await bed.used()
-    async with bed.holder() as holder:
-        await holder.ask("fill", bed.part_bytes)
+    async with bed.holder(size_bytes=bed.part_bytes) as holder:
         await holder.end()
         return await bed.returned(before) * 1000, "context and weights"
 
@@ -185,43 +182,34 @@ async def checkpoint(bed: Bed, action: Action | None = None) -> Found:
         raise Skipped(f"{error.message}; {error.hint}") from None
     before = await bed.used()
     # torch can share its expandable segments with processes, and shared memory stays (IPC)
-    plain = {"PYTORCH_CUDA_ALLOC_CONF": "expandable_segments:False"}
-    async with bed.holder(environ=plain) as holder:
+    async with bed.holder(PYTORCH_CUDA_ALLOC_CONF="expandable_segments:False") as holder:
         numbers = await holder.ask("number", bed.part_bytes)
-        times = [time.monotonic()]
-        await answered_within(CHECKPOINT_S, lambda: action.free([holder.pid]))
-        times.append(time.monotonic())
+        _, gone_ms = await _timed(answered_within(CHECKPOINT_S, lambda: action.free([holder.pid])))
         await bed.returned(before)
         left = await bed.used() - before
-        times.append(time.monotonic())
-        await answered_within(CHECKPOINT_S, lambda: action.restore([holder.pid]))
-        times.append(time.monotonic())
+        back = answered_within(CHECKPOINT_S, lambda: action.restore([holder.pid]))
+        _, back_ms = await _timed(back)
         if await holder.ask("sum") != numbers:
             raise Missed("the process continued with other numbers")
-    gone_s, back_s = times[1] - times[0], times[3] - times[2]
-    return left / MIB, f"suspended in {gone_s:.2f} s, resumed in {back_s:.2f} s"
+    return left / MIB, f"suspended in {gone_ms / 1000:.2f} s, resumed in {back_ms / 1000:.2f} s"
 
 
 # -- the arbiter
 @row("ms", **VERIFY)
 async def evict(bed: Bed) -> Found:
     """Measure the time from an evicted holder's release to its verdict, before the next grant."""
-    async with bed.holder("victim") as victim:
-        await victim.ask("fill", bed.part_bytes)
-        async with bed.holder("next") as following:
-            await following.ask("fill", bed.part_bytes)
-            events = (await bed.client.history(kinds=("verified",))).events
-            event = next(one for one in events if one["consumer"] == "victim")
-            if event["verdict"] != "verified":
-                raise Missed(f"the verdict is {event['verdict']}")
-            return event["ms"], "verified"
+    async with bed.holder("victim", bed.part_bytes), bed.holder("next", bed.part_bytes):
+        events = (await bed.client.history(kinds=("verified",))).events
+    event = next(one for one in events if one["consumer"] == "victim")
+    if event["verdict"] != "verified":
+        raise Missed(f"the verdict is {event['verdict']}")
+    return event["ms"], "verified"
 
 
 @row("MiB", source="limits.md", least=1)
 async def stowaway(bed: Bed) -> Found:
     """Measure the bytes of a stowaway that the daemon sees, while it grants nothing."""
-    async with bed.holder() as holder:
-        await holder.ask("fill", bed.part_bytes)
+    async with bed.holder(size_bytes=bed.part_bytes):
         await asyncio.sleep(d.SAMPLE_MAX_AGE_S)  # so long a reading from before it counts
         try:
             async with bed.client.lease(_all(bed), ASKING_S):
@@ -241,8 +229,7 @@ def _all(bed: Bed) -> LeaseSpec:
 @row("ms", **VERIFY)
 async def kill_holder(bed: Bed) -> Found:
     """Measure the time from a holder's SIGKILL to the grant of its bytes."""
-    async with bed.holder("killed") as holder:
-        await holder.ask("fill", bed.part_bytes)
+    async with bed.holder("killed", bed.part_bytes) as holder:
         began_s = time.monotonic()
         await holder.kill()
         async with bed.client.lease(_all(bed), VERIFY_TIMEOUT_S):
@@ -252,26 +239,24 @@ async def kill_holder(bed: Bed) -> Found:
 @row("s", source="lease.ttl_s + lease.fence_grace_s", most=d.LEASE_TTL_S + d.FENCE_GRACE_S)
 async def kill_daemon(bed: Bed) -> Found:
     """Measure the time from the daemon's SIGKILL until its successor knows the holder."""
-    async with bed.holder("kept") as holder:
-        await holder.ask("fill", bed.part_bytes)
-        before = await _held(bed)
-        used, began_s = await bed.used(), time.monotonic()
+    async with bed.holder("kept", bed.part_bytes):
+        lease, used, began_s = await _held(bed), await bed.used(), time.monotonic()
         await bed.restart_daemon()
-        await _held(bed, before)
+        if await _held(bed) != lease:
+            raise Missed("the lease is another one")
         seconds = time.monotonic() - began_s
         if (moved := abs(await bed.used() - used)) > VERIFY_TOLERANCE_BYTES:
             raise Missed(f"{moved / MIB:.0f} MiB changed on the GPU")
         return seconds, "the same lease, its bytes untouched"
 
 
-async def _held(bed: Bed, wanted: Sequence[str] = ()) -> list[str]:
-    """Wait until leases are held, and those wanted where any are. Return their ids."""
+async def _held(bed: Bed) -> str:
+    """Wait until a daemon answers that a lease is held. Return the id."""
     while True:
-        with suppress(VramError):  # no daemon answers yet
-            leases = (await bed.client.status()).leases
-            held = [one.lease_id for one in leases if one.state == "held"]
-            if held and held == list(wanted or held):
-                return held
+        with suppress(VramError):
+            for one in (await bed.client.status()).leases:
+                if one.state == "held":
+                    return one.lease_id
         await asyncio.sleep(BEAT_S)
 
 
@@ -307,10 +292,7 @@ def _model(skill: str, budget_ms: float) -> dict[str, Any]:
 @row("ms", **_model(DETECTOR, 1000))
 async def detector(bed: Bed) -> Found:
     """Measure the time in which a detector finds a drawn cube."""
-    picture = _cube()
-    found, told = await _answered(
-        bed, DETECTOR, lambda client, _: client.detect(picture, "red cube")
-    )
+    found, told = await _answered(bed, DETECTOR, lambda at, _: at.detect(_cube(), "red cube"))
     if not found or math.dist(found[0].centre, CUBE_PX) > CUBE_SIDE_PX / 2:
         raise Missed(f"expected the cube at {CUBE_PX}, found {found[:1]}")
     return told
@@ -319,8 +301,8 @@ async def detector(bed: Bed) -> Found:
 @row("ms", **_model(VLM, 3000))
 async def vlm(bed: Bed) -> Found:
     """Measure the time in which a scene VLM answers about it."""
-    picture, question = _cube(), "Has the robot gripper grasped the red cube?"
-    said, told = await _answered(bed, VLM, lambda client, _: client.query(picture, question))
+    question = "Has the robot gripper grasped the red cube?"
+    said, told = await _answered(bed, VLM, lambda at, _: at.query(_cube(), question))
     if not said.startswith("No"):
         raise Missed(f"the drawn cube lies on a table, and the answer is {said!r}")
     return told
@@ -341,23 +323,13 @@ async def _answered(
     """Return a model's second answer and its time: the first loads its kernels."""
     before = await bed.used()
     async with bed.model(skill) as (client, manifest):
-        for _ in range(2):
-            began_s = time.perf_counter()
-            answer = await ask(client, manifest)
-            seconds = time.perf_counter() - began_s
-        size = f"resident in {(await bed.used() - before) / MIB:.0f} MiB"
-        return answer, (seconds * 1000, size)
+        await ask(client, manifest)
+        answer, ms = await _timed(ask(client, manifest))
+        return answer, (ms, f"resident in {(await bed.used() - before) / MIB:.0f} MiB")
 
 
 def _cube() -> bytes:
-    """Return a picture of a red cube on a table: 640 x 480 pixels, as PNG."""
-    from PIL import Image, ImageDraw
-
-    picture, written = Image.new("RGB", (640, 480), "#969696"), io.BytesIO()
-    for corners, color in CUBE:
-        ImageDraw.Draw(picture).polygon(corners, fill=color)
-    picture.save(written, "PNG")
-    return written.getvalue()
+    return (configs_folder(os.environ) / CUBE).read_bytes()
 
 
 # -- the end

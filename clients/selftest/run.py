@@ -62,27 +62,20 @@ class Result:
 
 async def selftest(
     wanted: Order, begun: Callable[[Gpu], None], tell: Callable[[Result], None]
-) -> list[Result]:
+) -> None:
     """Measure all rows, and tell each result as it comes; `begun` is told the GPU before.
 
     Raises ConfigError where the GPU is leased or has no room, NoGpu, ProbeFailed, and
     SidecarUnavailable where the daemon does not start.
     """
     deadline_s = time.monotonic() + wanted.within_s
-    results: list[Result] = []
-
-    async def judge(row: Claim, bed: Bed, left_s: float) -> None:
-        results.append(await judged(row, bed, left_s))
-        tell(results[-1])
-
     # short, for the paths of its sockets
     with tempfile.TemporaryDirectory(prefix="vram-st", ignore_cleanup_errors=True) as folder:
         async with _made(wanted, folder) as bed:
             begun(bed.gpu)
             for row in wanted.rows:
-                await judge(row, bed, deadline_s - time.monotonic())
-        await judge(LAST, bed, LAST.limit_s)
-    return results
+                tell(await judged(row, bed, deadline_s - time.monotonic()))
+        tell(await judged(LAST, bed, LAST.limit_s))
 
 
 @asynccontextmanager

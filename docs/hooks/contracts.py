@@ -8,6 +8,7 @@ from pathlib import Path
 import yaml
 
 from vram_arbiter.clients.observer import names as of_the_arbiter  # noqa: F401  it describes metrics
+from vram_arbiter.clients.selftest.rows import LAST, ROWS
 from vram_arbiter.reasoner.llm import names as of_language_models  # noqa: F401  as above
 from vram_arbiter.schemas.errors import CODES, VramError
 from vram_arbiter.schemas.plain import JsonMap
@@ -142,6 +143,20 @@ def metrics() -> str:
         for name, about in sorted(INSTRUMENTS.items())
     ]
     return "\n".join(["| metric | unit | meaning |", "| --- | --- | --- |", *rows])
+
+
+def decisions(folder: Path) -> str:
+    """Return links to the records of decisions, by their titles."""
+    titles = {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.glob("0*.md"))}
+    return "\n".join(
+        f"- [{text.partition('\n')[0].removeprefix('# ')}]({name})" for name, text in titles.items()
+    )
+
+
+def selftest() -> str:
+    """Return the table of a self-test's rows."""
+    rows = [f"| `{row.id}` | {row.what} | {row.limit} | {row.source} |" for row in (*ROWS, LAST)]
+    return "\n".join(["| row | measures | limit | source |", "| --- | --- | --- | --- |", *rows])
 
 
 def errors() -> str:

@@ -42,6 +42,8 @@ GENERATED: Mapping[str, Callable[[], str]] = {
     "errors": contracts.errors,
     "schemas": lambda: contracts.schema_list(TREE / SCHEMAS),
     "metrics": contracts.metrics,
+    "decisions": lambda: contracts.decisions(TREE / "docs/explanation/adr"),
+    "selftest": contracts.selftest,
     **{name: partial(programs.page, name) for name in programs.parsers()},
 }
 MARK = re.compile(r"^<!-- generated: ([\w-]+) -->$", re.MULTILINE)

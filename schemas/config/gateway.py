@@ -17,6 +17,9 @@ LISTEN: Final = "127.0.0.1:8000"
 PRIORITY: Final = 40
 """Of servers, as of `vramctl run`: below the 50 of a robot's models."""
 PARALLEL_MAX: Final = 1024
+RESIDENCY_MIN_S: Final = 0.25
+"""Time for the request that a server was started for to begin. Of three servers that could be
+evicted earlier, none ever answered."""
 OnEvict = Literal["stop", "http", "vllm", "ollama", "llama.cpp", "comfyui", "cuda-checkpoint"]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 Model = Annotated[str, Field(min_length=1, max_length=256)]
@@ -76,7 +79,7 @@ class ServerConfig(_Section):
     """UUID, index or `any`."""
     priority: Annotated[int, Field(ge=0, le=d.PRIORITY_MAX)] = PRIORITY
     """Priority of its lease. Servers of one priority take turns."""
-    min_residency_s: Annotated[float, Field(ge=0, le=86_400)] = d.MIN_RESIDENCY_S
+    min_residency_s: Annotated[float, Field(ge=RESIDENCY_MIN_S, le=86_400)] = d.MIN_RESIDENCY_S
     """Seconds after its load in which it is not evicted."""
     idle_s: Seconds | None = None
     """It leaves after so long without a request. Null: it stays until another needs the room."""

@@ -1,21 +1,21 @@
-"""Choice of the device memory that a sidecar's settings name."""
+"""Choice of the device memory that a sidecar's `--device` names."""
 
 from pathlib import Path
 
+from vram_arbiter.schemas.defaults import RESIDUE_BYTES
 from vram_arbiter.sidecars.device.memory import DeviceMemory
-from vram_arbiter.sidecars.settings import Settings
 
 
-def open_memory(settings: Settings) -> DeviceMemory:
-    """Open the device of the settings. Raises NoGpu or ConfigError."""
-    if settings.device == "none":
+def open_memory(device: str, name: str, context_bytes: int = RESIDUE_BYTES) -> DeviceMemory:
+    """Open `fake:FOLDER`, `cuda`, `cuda:N` or `none` for the process `name`. `context_bytes` are
+    assumed where the GPU does not tell. Raises NoGpu or ConfigError."""
+    if device == "none":
         return DeviceMemory()
-    if settings.device.startswith("fake:"):
+    if device.startswith("fake:"):
         from vram_arbiter.sidecars.device.fake import FakeMemory
 
-        folder = Path(settings.device.removeprefix("fake:"))
-        return FakeMemory(folder, settings.name, settings.footprint.residue_bytes)
+        return FakeMemory(Path(device.removeprefix("fake:")), name, context_bytes)
     from vram_arbiter.sidecars.device.cuda import CudaMemory
 
-    index = settings.device.partition(":")[2]
-    return CudaMemory(int(index) if index else None, settings.footprint.residue_bytes)
+    index = device.partition(":")[2]
+    return CudaMemory(int(index) if index else None, context_bytes)

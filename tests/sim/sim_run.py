@@ -13,7 +13,9 @@ import logging
 import multiprocessing
 import os
 import re
+import signal
 import sys
+import threading
 import time
 import warnings
 from collections import Counter
@@ -228,7 +230,7 @@ def run_many(seeds: Sequence[int], jobs: int, stop_at: int = 5) -> list[Report]:
     """All seeds, on `jobs` processes; stops early after some failures."""
     reports: list[Report] = []
     failed = 0
-    with multiprocessing.get_context("spawn").Pool(jobs, initializer=_quiet) as pool:
+    with multiprocessing.get_context("spawn").Pool(jobs, initializer=_begin) as pool:
         for report in pool.imap_unordered(run_seed, seeds, chunksize=CHUNK):
             reports.append(report)
             if report.failure:
@@ -240,6 +242,20 @@ def run_many(seeds: Sequence[int], jobs: int, stop_at: int = 5) -> list[Report]:
             if len(reports) % 100 == 0:
                 print(f"{len(reports)} of {len(seeds)} seeds, {failed} failed", flush=True)
     return sorted(reports, key=lambda report: report.seed)
+
+
+def _begin() -> None:
+    """Begin a worker: it ends with the program that started it, and removes its folder."""
+    _quiet()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _quiet() -> None:

@@ -5,6 +5,9 @@ again."""
 import asyncio
 import contextlib
 import functools
+import os
+import subprocess
+import sys
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +16,12 @@ import pytest
 
 from tests.sim.sim_clients import SimClient
 from tests.sim.sim_run import run_seed, summary
+from tests.support.processes import alive, children
 from tests.support.simulation.clock import Clock, new_loop
 from tests.support.simulation.daemon import Happening
 from tests.support.simulation.device import Device, SimOutOfMemory
 from tests.support.simulation.world import Entitlement, SimFailure, SimProcess, World
+from tests.support.waiting import until
 from vram_arbiter.clients._spec import checked_spec
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.defaults import GIB
@@ -305,3 +310,27 @@ def test_an_unloading_that_crosses_the_withdrawal_completes(tmp_path: Path, lost
     for process in (holder, waiter):
         made.kill(process)
     made.kill_daemon()
+
+
+# -- many
+ENDS_S = 10.0
+"""Shorter than the seeds take that a worker has been given."""
+
+
+def folders_of(pid: int) -> set[Path]:
+    """Return the folders of a simulation in which a process has files open."""
+    found = set()
+    for one in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(OSError):
+            found |= {path for path in Path(os.readlink(one)).parents if "vram-sim-" in path.name}
+    return found
+
+
+def test_workers_end_with_the_program_that_started_them() -> None:
+    """They simulated on, and kept their folders."""
+    command = [sys.executable, "-m", "tests.sim.sim_run", "--seeds", "100", "--jobs", "1"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
+        found = until(lambda: {pid: made for pid in children(run.pid) if (made := folders_of(pid))})
+        run.kill()
+    until(lambda: not any(map(alive, found)), ENDS_S)
+    assert [folder for folders in found.values() for folder in folders if folder.exists()] == []

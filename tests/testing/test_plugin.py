@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from tests.support.paths import ROOT
-from tests.support.waiting import PATIENCE_S
+from tests.support.processes import alive
+from tests.support.waiting import PATIENCE_S, until
 
 PLUGIN = "vram_arbiter.testing.plugin"
 SUITE = """
@@ -118,3 +119,30 @@ def test_the_example_project_passes(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
     assert "3 passed" in done.stdout
     assert list((tmp_path / "t").glob("va*")) == []
+
+
+KILLED = """
+import sys, threading
+from vram_arbiter.testing.daemon import ArbiterProcess
+
+arbiter = ArbiterProcess()
+starting = threading.Thread(target=arbiter.start)
+starting.start()
+starting.join()
+print(arbiter.pid, flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_killed_test_takes_its_daemon_along(short_folder: Path) -> None:
+    """It ran on, with its folder; the end of the thread that started it does not end it."""
+    environ = os.environ | {"TMPDIR": str(short_folder)}
+    command = [sys.executable, "-c", KILLED]
+    with subprocess.Popen(
+        command, env=environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as test:
+        assert test.stdout is not None
+        daemon = int(test.stdout.readline())
+        assert alive(daemon)
+        test.kill()
+    until(lambda: not alive(daemon))

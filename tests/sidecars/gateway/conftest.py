@@ -86,7 +86,7 @@ def stand_in(arbiter: ArbiterProcess, gib: float, **fields: Any) -> dict[str, An
     return {
         "command": [*command, "{port}"],
         "vram": f"{gib}GiB",
-        "min_residency_s": 0.0,
+        "min_residency_s": 0.25,
         "grace_s": PATIENCE_S,
         "wait_s": PATIENCE_S,
         **fields,

@@ -152,6 +152,16 @@ async def test_clients_of_two_servers_on_room_for_one_all_get_their_answers(
     assert max(switches.values()) <= 4
 
 
+@pytest.mark.nightly
+async def test_three_servers_in_room_for_one_all_answer(
+    gateway: Start, arbiter_daemon: ArbiterProcess
+) -> None:
+    """Evicted as soon as they had loaded, they threw each other out for ever."""
+    started = gateway({name: stand_in(arbiter_daemon, 5) for name in "abc"})
+    async with openai_client(started) as client:
+        assert await asyncio.gather(*(ask(client, name) for name in "abcabc")) == [ANSWER] * 6
+
+
 async def test_a_sleeping_server_wakes_for_a_request_and_not_before(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:

@@ -31,6 +31,7 @@ def test_a_unit_or_container_takes_the_place_of_the_command(kind: str) -> None:
         ("unit: --user, port: 1", "'--user' is not"),
         ("container: a b, port: 1", "'a b' is not"),
         ("unit: a, port: 1, env: {A: b}", "an environment of its own"),
+        ("unit: a, port: 1, min_residency_s: 0", "min_residency_s.*0.25"),
     ],
 )
 def test_anything_else_is_refused(text: str, problem: str) -> None:

@@ -41,7 +41,7 @@ def servers(
         configured[name] = {
             "command": [*program, str(5 << 30), str(model), "{port}"],
             "vram": "5GiB",
-            "min_residency_s": 0.0,
+            "min_residency_s": 0.25,
             "grace_s": PATIENCE_S,
         }
     yield gateway(configured)
