@@ -205,6 +205,29 @@ def test_coroutines_and_one_that_is_canceled_while_it_waits(
     until(lambda: model.lease.uses == 0)
 
 
+@pytest.mark.heavy
+@pytest.mark.e2e
+def test_a_task_runs_inside_a_lease_of_its_own(
+    make: Make, arbiter_daemon: ArbiterProcess, client: Client
+) -> None:
+    """Ray runs the function; `make` says where the arbiter is."""
+    ray: Any = pytest.importorskip("ray")
+    make().act(1)  # its 5 of 8 GiB leave for the task
+
+    def job(x: int) -> int:
+        return x + int(client.status().leases[-1].consumer.startswith("job-"))
+
+    task = leased(vram="5GiB", model="job")(ray.remote(max_calls=1)(job))
+    assert task._function(41) == 42
+    for options, told in (
+        ({"num_cpus": 1}, "job is a task without max_calls=1"),
+        ({"num_gpus": 1}, "'num_gpus' stands beside"),
+        ({"max_calls": 1, "resources": {"vram_bytes": 1}}, "'vram_bytes' stands beside"),
+    ):
+        with pytest.raises(BadRequest, match=told):
+            leased(vram="5GiB", model="job")(ray.remote(**options)(job))
+
+
 def test_what_cannot_be_leased_is_refused_by_name() -> None:
     class Bare:
         def act(self) -> None: ...
