@@ -282,14 +282,15 @@ def _opened_uvm(pid: int) -> bool:
         return False
 
 
-def _model(skill: str, budget_ms: float) -> dict[str, Any]:
-    """Return the fields of a model's row; its limit is the manifest's."""
-    source = f"latency_budget of {skill}"
-    limits = {"source": source, "most": budget_ms, "limit_s": MODEL_S + ROW_S}
-    return {**limits, "skill": skill, "timed_model": True}
+def _model(skill: str, budget_ms: float) -> Callable[[Measure], Measure]:
+    """Make a row of a function that asks a model; its limit is the manifest's."""
+    return row(
+        "ms", source=f"latency_budget of {skill}", most=budget_ms, limit_s=MODEL_S + ROW_S,
+        skill=skill, timed_model=True,
+    )  # fmt: skip
 
 
-@row("ms", **_model(DETECTOR, 1000))
+@_model(DETECTOR, 1000)
 async def detector(bed: Bed) -> Found:
     """Measure the time in which a detector finds a drawn cube."""
     found, told = await _answered(bed, DETECTOR, lambda at, _: at.detect(_cube(), "red cube"))
@@ -298,7 +299,7 @@ async def detector(bed: Bed) -> Found:
     return told
 
 
-@row("ms", **_model(VLM, 3000))
+@_model(VLM, 3000)
 async def vlm(bed: Bed) -> Found:
     """Measure the time in which a scene VLM answers about it."""
     question = "Has the robot gripper grasped the red cube?"
@@ -308,7 +309,7 @@ async def vlm(bed: Bed) -> Found:
     return told
 
 
-@row("ms", **_model(POLICY, 400))
+@_model(POLICY, 400)
 async def policy(bed: Bed) -> Found:
     """Measure the time in which a policy answers to noise."""
     actions, told = await _answered(bed, POLICY, ASKED[Kind.VLA])

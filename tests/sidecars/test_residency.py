@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 import pytest
 
 from tests.sidecars.conftest import MANIFEST
+from tests.support.waiting import eventually
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.errors import Evicted, ModelError, NotPermitted, NotResident
 from vram_arbiter.schemas.manifest import parse_manifest
@@ -116,11 +117,6 @@ async def residing(daemon, models):
         await residency.leave()
 
 
-async def until(condition):
-    while not condition():
-        await asyncio.sleep(0.01)
-
-
 async def test_an_unload_between_the_grant_and_the_load_is_heard(arbiter_daemon):
     """Regression: the wait was over and the lease not taken yet, so there was nothing to give up,
     and the model was loaded."""
@@ -145,7 +141,7 @@ async def test_an_unload_without_an_arbiter_is_heard_in_the_middle_of_a_load_too
     models.may_load.clear()
     async with asyncio.timeout(WAIT_S):
         loading = asyncio.create_task(residency.load())
-        await until(lambda: models.loads)
+        await eventually(lambda: models.loads)
         await residency.unload()
         with pytest.raises(NotResident):
             await loading
@@ -185,21 +181,21 @@ async def test_a_model_that_is_wanted_soon_is_read_ahead_and_nothing_else(
         assert (await reasoner.prepare("nobody")).told == 0
         for _ in range(2):
             assert (await reasoner.prepare("eye")).told == 1
-        await until(lambda: models.in_host_ram)
+        await eventually(lambda: models.in_host_ram)
         assert (models.reads, models.loads, (await client.status()).leases) == (1, 0, ())
         await residency.load()
         assert (models.reads, residency.state) == (1, "resident"), "it was there already"
         await residency.unload()
-        await until(lambda: not models.in_host_ram)
+        await eventually(lambda: not models.in_host_ram)
         await reasoner.prepare("eye")
         # regression: the second hint in two minutes was ignored
-        await until(lambda: models.in_host_ram)
+        await eventually(lambda: models.in_host_ram)
         await residency.leave()
 
         monkeypatch.setattr("vram_arbiter.sidecars.host_copy.FORESEEN_S", 0.0)
         again = Residency(settings(arbiter_daemon), models, client)
         again.announce("reasoner")
-        await until(lambda: models.reads == 3 and not models.in_host_ram)
+        await eventually(lambda: models.reads == 3 and not models.in_host_ram)
         scarce = Models(weights_bytes=GB)
         crowded = Residency(settings(arbiter_daemon), scarce, client)
         crowded._host.size_bytes = (await client.status()).host_ram.budget_bytes + 1
@@ -217,12 +213,12 @@ async def test_weights_of_a_model_that_died_stay_for_the_next_request(arbiter_da
     async with residing(arbiter_daemon, models) as (residency, client):
         await residency.load()
         models.started[0].ended.set()
-        await until(lambda: residency.state == "unloaded")
+        await eventually(lambda: residency.state == "unloaded")
         await residency.load()
         assert (models.reads, residency.state) == (1, "resident")
         residency._host._expected_bytes = (await client.status()).host_ram.budget_bytes + 1
         models.started[1].ended.set()
-        await until(lambda: not models.in_host_ram)
+        await eventually(lambda: not models.in_host_ram)
 
 
 async def test_weights_stay_in_host_ram_while_the_arbiter_has_room_for_them(arbiter_daemon):
@@ -257,7 +253,7 @@ async def test_weights_leave_host_ram_where_the_arbiter_has_no_room_for_them(mak
     models = Models(weights_bytes=GB)
     async with residing(arbiter, models) as (residency, _):
         assert await residency.load()
-        await until(lambda: not models.in_host_ram)
+        await eventually(lambda: not models.in_host_ram)
         other = AsyncClient("other", endpoint=arbiter.endpoint)
         async with other, other.lease(vram=8 * GB):
             assert residency.state == "unloaded"
@@ -270,7 +266,7 @@ async def test_an_idle_model_is_parked(arbiter_daemon):
     async with residing(arbiter_daemon, models) as (residency, _):
         await residency.load()
         idle = asyncio.create_task(residency.release_when_idle(0.0))
-        await until(lambda: residency.state == "parked")
+        await eventually(lambda: residency.state == "parked")
         idle.cancel()
         assert models.in_host_ram
         assert await residency.load()
