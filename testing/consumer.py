@@ -16,7 +16,7 @@ from vram_arbiter.schemas.fakegpu import FOLDER_VARIABLE
 from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.views import LeaseView
 from vram_arbiter.testing import call
-from vram_arbiter.testing.daemon import STOP_S, ArbiterProcess
+from vram_arbiter.testing.daemon import ArbiterProcess
 from vram_arbiter.testing.waiting import WITHIN_S, eventually
 
 GONE: Final = "gone"
@@ -94,9 +94,9 @@ class Consumer:
     def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
         """Send it a signal, and return its exit code. Raises subprocess.TimeoutExpired."""
         self.process.send_signal(number)
-        return self.process.wait(STOP_S)
+        return self.process.wait(WITHIN_S)
 
-    def wait(self, timeout_s: float = STOP_S) -> int:
+    def wait(self, timeout_s: float = WITHIN_S) -> int:
         """Close its standard input, and return its exit code. Raises subprocess.TimeoutExpired."""
         assert self.process.stdin is not None
         with contextlib.suppress(BrokenPipeError):

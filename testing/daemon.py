@@ -15,10 +15,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Final, Self
 
-from vram_arbiter.testing.waiting import POLL_S, eventually
+from vram_arbiter.testing.waiting import POLL_S, WITHIN_S, eventually
 
-START_S: Final = 60.0
-STOP_S: Final = 60.0
 PROGRAM: Final = (sys.executable, "-m", "vram_arbiter.arbiter")
 FOREIGN: Final = ("VRAM_ARBITER_", "WATCHDOG_", "OTEL_")
 """Variables with which a program would find another daemon or collector."""
@@ -96,7 +94,7 @@ class ArbiterProcess:
         """Start the daemon and wait until it says READY. Raises RuntimeError with its log if it
         ends or stays silent."""
         self.spawn(extra_environ)
-        self.wait_for("READY=1", START_S)
+        self.wait_for("READY=1", WITHIN_S)
         return self
 
     def wait_for(self, word: str, timeout_s: float) -> str:
@@ -105,22 +103,18 @@ class ArbiterProcess:
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             ended = self.process.poll()  # first: what it said before its end is still read
-            if select.select([self._notify], [], [], POLL_S)[0]:
-                if word in self._heard():
+            if self._hear(POLL_S):
+                if word in self.messages[-1]:
                     return self.messages[-1]
             elif ended is not None:
                 raise RuntimeError(f"the arbiter ended with {ended}:\n{self.log}")
         raise RuntimeError(f"no {word} from the arbiter within {timeout_s} s:\n{self.log}")
 
-    def _heard(self) -> str:
-        self.messages.append(self._notify.recv(4096).decode())
-        return self.messages[-1]
-
-    def _put_aside(self) -> None:
-        """Read what the daemon has told by now: the kernel keeps no more than ten messages, and
-        drops the rest."""
-        while select.select([self._notify], [], [], 0)[0]:
-            self._heard()
+    def _hear(self, within_s: float = 0.0) -> bool:
+        """Read one notification; False if there is none."""
+        if there := select.select([self._notify], [], [], within_s)[0]:
+            self.messages.append(self._notify.recv(4096).decode())
+        return bool(there)
 
     def stop(self) -> int:
         """SIGTERM, and its exit code."""
@@ -132,10 +126,11 @@ class ArbiterProcess:
 
     def _end(self, number: signal.Signals) -> int:
         assert self.process is not None
-        self._put_aside()
+        while self._hear():  # the kernel keeps no more than ten, and drops the rest
+            pass
         if self.process.poll() is None:
             self.process.send_signal(number)
-        return self.process.wait(STOP_S)
+        return self.process.wait(WITHIN_S)
 
     def close(self) -> None:
         """End the daemon if it runs and remove the folder."""

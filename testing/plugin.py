@@ -5,6 +5,7 @@ Pytest imports it at each start, so it imports nothing else of the kit before a 
 """
 
 from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
@@ -74,18 +75,14 @@ def make_arbiter(request: pytest.FixtureRequest, arbiter_process: Make) -> Itera
     on it. Ended at teardown."""
     from vram_arbiter.testing.timeline import Timeline
 
-    made: list[ArbiterProcess] = []
-
     def make(*arguments: Any, **named: Any) -> "ArbiterProcess":
-        daemon = arbiter_process(*arguments, **named)
-        made.append(daemon)
+        daemon = ends.enter_context(closing(arbiter_process(*arguments, **named)))
         _show(request, "timeline of the arbiter", Timeline(daemon).text)
         _show(request, "log of the arbiter", lambda: daemon.log)
         return daemon
 
-    yield make
-    for daemon in made:
-        daemon.close()
+    with ExitStack() as ends:
+        yield make
 
 
 @pytest.fixture
@@ -120,17 +117,13 @@ def consumer(request: pytest.FixtureRequest, arbiter: "ArbiterProcess") -> Itera
     a process of its own. Ended at teardown."""
     from vram_arbiter.testing.consumer import Consumer
 
-    made: list[Consumer] = []
-
     def start(name: str, program: Any, *arguments: Any, **named: Any) -> "Consumer":
-        begun = Consumer(arbiter, name, program, *arguments, **named)
-        made.append(begun)
+        begun = ends.enter_context(closing(Consumer(arbiter, name, program, *arguments, **named)))
         _show(request, f"output of {name}", lambda: begun.output)
         return begun
 
-    yield start
-    for begun in made:
-        begun.close()
+    with ExitStack() as ends:
+        yield start
 
 
 @pytest.fixture

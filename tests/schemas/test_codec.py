@@ -143,3 +143,11 @@ class One:
 @pytest.mark.parametrize("value", [Nothing(), One("a")])
 def test_classes_of_no_field_and_of_one_have_a_map(value: Any) -> None:
     assert from_map(type(value), to_map(value)) == value
+
+
+@pytest.mark.parametrize("value", [Nothing(), One("a")])
+def test_the_hints_of_a_class_are_read_once(monkeypatch: pytest.MonkeyPatch, value: Any) -> None:
+    """Regression: those of a class without fields, such as `Ping`, were read with each value."""
+    assert from_map(type(value), to_map(value)) == value
+    monkeypatch.setattr(codec, "get_type_hints", None)
+    assert from_map(type(value), to_map(value)) == value

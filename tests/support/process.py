@@ -1,7 +1,6 @@
 """A daemon and `vramctl` for our own tests, forked from interpreters that have imported them."""
 
 import os
-import select
 import subprocess
 import sys
 import time
@@ -51,10 +50,11 @@ class ArbiterProcess(daemon.ArbiterProcess):
     def heard(self, seconds: float) -> list[str]:
         """What the daemon tells its manager from now on, for so long; what it told before is put
         aside (`messages`)."""
-        self._put_aside()
+        while self._hear():
+            pass
         before, deadline = len(self.messages), time.monotonic() + seconds
-        while select.select([self._notify], [], [], max(0.0, deadline - time.monotonic()))[0]:
-            self._heard()
+        while self._hear(max(0.0, deadline - time.monotonic())):
+            pass
         return self.messages[before:]
 
 
