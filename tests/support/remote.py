@@ -46,6 +46,11 @@ class Remote:
         self._server.authorize(USER, "grab", doors=doors)
 
     @property
+    def sidecar(self) -> Path:
+        """The socket of `grab` on the server; its own group is the test's."""
+        return self.arbiter.runtime / "grab.sock"
+
+    @property
     def host(self) -> str:
         return f"{USER}@127.0.0.1:{self.sshd.port}"
 

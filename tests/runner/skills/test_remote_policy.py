@@ -9,37 +9,21 @@ from pathlib import Path
 
 import pytest
 
-from tests.runner.skills.policy_bench import MANIFEST, Bench, Sidecar
+from tests.runner.skills.policy_bench import MANIFEST, Bench, Leased
 from tests.support.guests import USER
 from tests.support.process import Make
 from tests.support.remote import Remote
 from tests.support.waiting import eventually
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.clients.lease import AsyncLease
-from vram_arbiter.clients.net.server import Peer
 from vram_arbiter.runner.protocols import Act, Goal, Hold
 from vram_arbiter.runner.skills import sidecar_policy
 from vram_arbiter.schemas.errors import SidecarUnavailable
 from vram_arbiter.schemas.manifest import parse_manifest
-from vram_arbiter.schemas.plain import Message
 
 pytestmark = [pytest.mark.anyio, pytest.mark.heavy, pytest.mark.e2e, pytest.mark.nightly]
 
 GOAL = Goal("g1", "test/arm-grab", prompt="grab the red cube", deadline_s=60.0)
 HUNG_S = 1.0
-
-
-class Leased(Sidecar):
-    """Its model has a lease at the server's arbiter."""
-
-    lease: AsyncLease
-
-    async def handle(self, peer: Peer, message: Message) -> None:
-        if message["endpoint"] == "load":
-            told = {"lease_id": self.lease.lease_id, "token": list(self.lease.token)}
-            await self.server.send(peer, {"re": message["id"], "ok": True, "loaded": True, **told})
-        else:
-            await super().handle(peer, message)
 
 
 @dataclass
@@ -70,8 +54,9 @@ async def robot(
         async with (
             AsyncClient("grab", endpoint=remote.arbiter.endpoint) as server,
             server.lease(vram="1GiB", model="pi0", unload=lambda: None) as sidecar.lease,
-            sidecar.served(f"ipc://{remote.arbiter.runtime}/grab.sock"),
+            sidecar.served(f"ipc://{remote.sidecar}"),
         ):
+            remote.sidecar.chmod(0o666)
             await sidecar.lease.ready()
             await asyncio.to_thread(remote.up, "grab")
             async with AsyncClient("runner", endpoint=remote.endpoint) as guest:
