@@ -29,7 +29,7 @@ makes room."""
 GUEST_HEARTBEAT_S = 1.0
 GUEST_SILENT_BEATS = 4
 """A guest that said nothing for so many heartbeats has no network: its uses end. sshd is not waited
-for: 9.2 takes 8 s for a nominal 4, and for ever while the server has something to send."""
+for: 9.2 takes 8 s for a nominal 4, and over 30 while the server has something to send."""
 NEWCOMERS = 8
 """One in so many places is for processes that have no session yet."""
 
