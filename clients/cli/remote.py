@@ -2,6 +2,7 @@
 
 import argparse
 import asyncio
+import contextlib
 import os
 import signal
 import sys
@@ -58,28 +59,13 @@ def _add_up(parser: argparse.ArgumentParser) -> None:
         "host", metavar="HOST", help="[USER@]NAME[:PORT]; NAME may be a Host of ~/.ssh/config"
     )
     parser.add_argument("sidecars", metavar="SIDECAR", nargs="*", help="sidecars to forward")
+    door = "loopback port of a sidecar's door: here, and there if it differs"
     parser.add_argument(
-        "--door",
-        type=_door,
-        action="append",
-        default=[],
-        metavar="PORT[:PORT]",
-        help="loopback port of a sidecar's door: here, and there if it differs",
+        "--door", type=_door, action="append", default=[], metavar="PORT[:PORT]", help=door
     )
     parser.add_argument("--identity", type=Path, metavar="FILE", help="the robot's private key")
-    parser.add_argument(
-        "--known-hosts",
-        type=Path,
-        metavar="FILE",
-        help="the server's host key; any other is refused (default: "
-        "~/.config/vram-arbiter/known_hosts)",
-    )
-    parser.add_argument(
-        "--server-runtime",
-        default=SYSTEM_RUNTIME,
-        metavar="FOLDER",
-        help="the server's folder of sockets (default: %(default)s)",
-    )
+    place = "the server's folder of sockets (default: %(default)s)"
+    parser.add_argument("--server-runtime", default=SYSTEM_RUNTIME, metavar="FOLDER", help=place)
 
 
 def _door(written: str) -> tuple[int, int]:
@@ -88,16 +74,13 @@ def _door(written: str) -> tuple[int, int]:
     return int(port(here)), int(port(there or here))
 
 
-def _config_home() -> Path:
-    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
-
-
 def _up(args: argparse.Namespace) -> int:
     """Keep the tunnel until SIGTERM or SIGINT. Raises RemoteRefused, ConfigError, AlreadyRunning."""
+    settings = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
     tunnel = ssh.Tunnel(
         args.host,
         ssh.folder_of(args.host, os.environ, os.getuid()),
-        args.known_hosts or _config_home() / "vram-arbiter/known_hosts",
+        settings / "vram-arbiter/known_hosts",
         tuple(args.sidecars),
         tuple(args.door),
         args.server_runtime,
@@ -121,19 +104,16 @@ def _lock(folder: Path) -> LockFile:
 
 async def _keep(tunnel: ssh.Tunnel) -> int:
     notifier = Notifier(os.environ)
-    keeper = Keeper(
-        tunnel,
-        say=lambda line: print(line, file=sys.stderr, flush=True),
-        up=lambda: notifier.ready("up"),
-        down=lambda: notifier.status("connecting"),
-    )
-    keeping = asyncio.ensure_future(keeper.keep())
+
+    def tell(line: str, up: bool) -> None:
+        print(line, file=sys.stderr, flush=True)
+        (notifier.ready if up else notifier.status)(line)
+
+    keeping = asyncio.ensure_future(Keeper(tunnel, tell).keep())
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, keeping.cancel)
-    try:
+    with contextlib.suppress(asyncio.CancelledError):
         await keeping
-    except asyncio.CancelledError:
-        notifier.stopping("asked to end")
     return OK
 
 
@@ -153,50 +133,43 @@ def _status(args: argparse.Namespace) -> int:
 def _tunnels() -> Message:
     place = ssh.tunnels_folder(os.environ, os.getuid())
     folders = sorted(place.iterdir()) if place.is_dir() else []
-    return {"ok": True, "tunnels": [asyncio.run(_tunnel(folder)) for folder in folders]}
+    return {"ok": True, "tunnels": [_tunnel(folder) for folder in folders]}
 
 
-async def _tunnel(folder: Path) -> Message:
+def _tunnel(folder: Path) -> Message:
     """Return what is known of a tunnel: `state` (up, connecting, down), and if it is up what the
     server's arbiter says."""
-    told: Message = {"host": ssh.host_of(folder), "state": "down", "sidecars": {}}
+    sockets = {path.stem: f"{IPC}{path}" for path in sorted(folder.glob("*.sock"))}
+    told: Message = {"host": ssh.host_of(folder), "state": "connecting", "sidecars": sockets}
+    endpoint = sockets.pop(ssh.ARBITER, "")
     try:
         _lock(folder).check_free()
-        return told
+        return {**told, "state": "down"}
     except AlreadyRunning:
-        told["state"] = "connecting"
-    sockets = _sockets(folder)
-    endpoint = sockets.pop(ssh.ARBITER, "")
-    if not endpoint or not is_listening(endpoint):
-        return told
+        return told | (asyncio.run(_asked(endpoint)) if is_listening(endpoint) else {})
+
+
+async def _asked(endpoint: str) -> Message:
     try:
         async with AsyncClient("vramctl", endpoint=endpoint, connect_timeout_s=STATUS_S) as arbiter:
             began_s = time.monotonic()
             await arbiter.ping(timeout_s=STATUS_S)
             round_trip_ms = round(1e3 * (time.monotonic() - began_s), 2)
-            up = {"state": "up", "role": arbiter.role, "round_trip_ms": round_trip_ms}
+            return {"state": "up", "role": arbiter.role, "round_trip_ms": round_trip_ms}
     except VramError as error:
-        return {**told, "problem": error.to_wire()}
-    return {**told, **up, "sidecars": sockets}
-
-
-def _sockets(folder: Path) -> dict[str, str]:
-    return {path.stem: f"{IPC}{path}" for path in sorted(folder.glob("*.sock"))}
+        return {"problem": error.message}
 
 
 @makes_printable
 def _lines(told: Message) -> list[str]:
     if not told["tunnels"]:
         return ["no tunnel; `vramctl remote up HOST` makes one"]
-    columns = ("HOST", "STATE", "ROUND TRIP", "ROLE", "SIDECARS")
+    columns = {"host": "HOST", "state": "STATE", "round_trip_ms": "MS", "role": "ROLE"}
     rows = [
-        (
-            one["host"],
-            one["state"],
-            f"{one['round_trip_ms']:g} ms" if "round_trip_ms" in one else "",
-            one.get("role", ""),
-            ", ".join(one["sidecars"]) or one.get("problem", {}).get("message", ""),
-        )
+        [
+            *(str(one.get(key, "")) for key in columns),
+            one.get("problem", ", ".join(one["sidecars"])),
+        ]
         for one in told["tunnels"]
     ]
-    return text.table(columns, rows)
+    return text.table([*columns.values(), "SIDECARS"], rows)

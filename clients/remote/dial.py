@@ -3,12 +3,13 @@ standard input and output.
 
 sshd writes a reply in pieces and, without TCP_NODELAY, waits for the ACK of one before it sends the
 next; the robot's kernel delays that ACK by 40 ms. TCP_QUICKACK sends it at once. The kernel clears
-the option by itself (tcp(7)), so it is set again around every read. 450 kB take 5 ms for 44.
+the option by itself (tcp(7)), so it is set again around every read. A request of 450 kB takes 44 ms by ssh as it comes.
 
 Run as a file by its path, which takes 20 ms: it imports the standard library alone, not even this
 package.
 """
 
+import fcntl
 import os
 import socket
 import sys
@@ -17,6 +18,8 @@ import time
 
 CONNECT_TIMEOUT_S = 10.0
 CHUNK_BYTES = 1 << 18
+PIPE_BYTES = 1 << 20
+"""Of ssh's pipes, if the kernel allows it: a request of 450 kB passes 64 kB in seven turns."""
 LINGER_S = 10.0
 """For the server's last words once ssh has ended: on a silent network they never come."""
 
@@ -25,6 +28,8 @@ def main(argv: list[str]) -> int:
     """Relay until the server has hung up. Returns the exit code: 0, or 1 with one line on
     stderr."""
     host, port = argv
+    for pipe in (sys.stdin, sys.stdout):
+        _enlarge(pipe.fileno())
     try:
         with socket.create_connection((host, int(port)), CONNECT_TIMEOUT_S) as connected:
             connected.settimeout(None)
@@ -37,6 +42,13 @@ def main(argv: list[str]) -> int:
         print(f"dial {host} port {port}: {error.strerror or error}", file=sys.stderr)
         return 1
     return 0
+
+
+def _enlarge(pipe: int) -> None:
+    try:
+        fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+    except OSError:
+        return  # no pipe, or this user has many
 
 
 def _send(connected: socket.socket) -> None:

@@ -10,9 +10,8 @@ import os
 import re
 from asyncio.subprocess import DEVNULL, PIPE, Process
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Never
 
@@ -32,101 +31,65 @@ LAST_WORDS_S: Final = 1.0
 WORDS_MAX: Final = 20  # lines of ssh that are looked at
 
 
-@dataclass(frozen=True, slots=True)
-class Refusal:
-    """What ssh says of one. `lasting`: also of a server that was reached before; a machine that
-    starts has its sshd before its sockets."""
-
-    said: str
-    reason: str
-    hint: str
-    lasting: bool = True
-
-
-REFUSALS: Final = (
-    Refusal(
-        "REMOTE HOST IDENTIFICATION HAS CHANGED",
-        "host_key_changed",
-        "another machine answers, or the server was set up anew: ask its operator, then replace "
-        "its line in {known_hosts}",
+REFUSALS: Final[Mapping[str, tuple[str, str]]] = {
+    "host_key": (
+        r"host key is known for|HAS CHANGED|Host key verification failed",
+        "if the server's operator reads the same from `ssh-keygen -lf` of its host key, put the "
+        "line that `ssh-keyscan` prints into {known_hosts}, in place of an old one",
     ),
-    Refusal(
-        "Host key verification failed",
-        "host_key_unknown",
-        "`ssh-keyscan {scan} >> {known_hosts}`, once its `ssh-keygen -lf {known_hosts}` is what "
-        "the server's operator reads from /etc/ssh/ssh_host_ed25519_key.pub",
-    ),
-    Refusal(
+    "key": (
         r"Permission denied \(|Too many authentication failures",
-        "key_refused",
         "on the server: `vramctl remote authorize`, with this robot's public key and this user",
     ),
-    Refusal(
-        "is not served there",  # sshd does not tell why: its log does
-        "not_served",
-        "on the server: is it started, in the folder of --server-runtime, is the user in the group "
-        "vram-arbiter, and may its key forward? see sshd's log",
-        lasting=False,
+    "not_served": (  # sshd does not tell why: its log does
+        r"is not served there",
+        "on the server: is it started, in the folder of --server-runtime, and may this key and "
+        "this user reach it? see sshd's log",
     ),
-    Refusal(
+    "port": (
         r"Address already in use|cannot listen to port|Could not request local forwarding",
-        "not_forwarded",
         "another program of this robot has the port",
     ),
-)
+}
+"""What ssh, or the keeper, says of a refusal, and what to do about it, by `details.reason`."""
+PASSING: Final = frozenset({"not_served"})
+"""Of a server that was reached before: a machine that starts has its sshd before its sockets."""
 
 
 def refusal(tunnel: Tunnel, words: Sequence[str], *, reached: bool) -> RemoteRefused | None:
     """Return the refusal that ssh's words tell of. `reached`: the tunnel was up before."""
-    for one in REFUSALS:
-        found = [line for line in words if re.search(one.said, line)]
-        if found and (one.lasting or not reached):
-            host = next(filter(None, map(_scanned, words)), tunnel.host)
+    for reason, (said, hint) in REFUSALS.items():
+        found = [line for line in words if re.search(said, line)]
+        if found and not (reached and reason in PASSING):
             return RemoteRefused(
                 f"{tunnel.host} refuses the tunnel: {found[0].strip('@ ')}",
-                hint=one.hint.format(known_hosts=tunnel.known_hosts, scan=host),
-                details={"host": tunnel.host, "reason": one.reason, "ssh": list(words)},
+                hint=hint.format(known_hosts=tunnel.known_hosts),
+                details={"host": tunnel.host, "reason": reason, "ssh": list(words)},
             )
     return None
 
 
-def _scanned(line: str) -> str:
-    """Return ssh-keyscan's arguments for the server that a line of ssh says is unknown."""
-    found = re.search(r"host key is known for (?:\[(\S+)\]:(\d+)|(\S+))", line)
-    if found is None:
-        return ""
-    return found[3] or f"-p {found[2]} {found[1]}"
-
-
 class Keeper:
-    """`keep` runs until it is canceled, or the server refuses. `say` gets lines for people, `up`
-    and `down` are called as the tunnel comes and goes."""
+    """`keep` runs until it is canceled, or the server refuses. `tell` gets lines for people, and
+    whether the tunnel is up."""
 
-    def __init__(
-        self,
-        tunnel: Tunnel,
-        say: Callable[[str], object],
-        up: Callable[[], object] = lambda: None,
-        down: Callable[[], object] = lambda: None,
-    ) -> None:
+    def __init__(self, tunnel: Tunnel, tell: Callable[[str, bool], None]) -> None:
         self._tunnel = tunnel
-        self._say = say
-        self._up = up
-        self._down = down
+        self._tell = tell
         self._words: deque[str] = deque(maxlen=WORDS_MAX)
-        self._reached = self._is_up = False
+        self._is_up = False
 
     async def keep(self) -> Never:
         """Raises RemoteRefused, ConfigError."""
-        pause_s = RETRY_S
+        pause_s, reached = RETRY_S, False
         while True:
             self._words.clear()
             if await self._one():
-                self._reached, pause_s = True, RETRY_S
-            elif error := refusal(self._tunnel, self._words, reached=self._reached):
+                pause_s, reached = RETRY_S, True
+            elif error := refusal(self._tunnel, self._words, reached=reached):
                 raise error
             why = self._words[-1] if self._words else "ssh ended"
-            self._say(f"no tunnel to {self._tunnel.host}: {why}; again in {pause_s:g} s")
+            self._tell(f"no tunnel to {self._tunnel.host}: {why}; again in {pause_s:g} s", False)
             await asyncio.sleep(pause_s)
             pause_s = min(2 * pause_s, RETRY_MAX_S)
 
@@ -137,14 +100,12 @@ class Keeper:
             if problem := await self._unready(ssh):
                 self._words.append(problem)
                 return False
-            self._say(f"tunnel to {self._tunnel.host} is up: {', '.join(self._tunnel.names)}")
             self._is_up = True
-            self._up()
-            try:
-                await ssh.wait()
-            finally:
-                self._is_up = False
-                self._down()
+            self._tell(
+                f"tunnel to {self._tunnel.host} is up: {', '.join(self._tunnel.names)}", True
+            )
+            await ssh.wait()
+            self._is_up = False
             return True
 
     async def _unready(self, ssh: Process) -> str:
@@ -193,7 +154,7 @@ class Keeper:
             if text := printable(line.decode(errors="replace").strip()):
                 self._words.append(text)
                 if self._is_up:  # such as a channel that the server refuses
-                    self._say(f"{self._tunnel.host}: {text}")
+                    self._tell(f"{self._tunnel.host}: {text}", True)
 
 
 async def _unserved(path: Path) -> str:

@@ -24,11 +24,12 @@ class Remote:
         self._server = Server(make_arbiter, folder / "sshd", (USER,))
         self.arbiter, self.sshd = self._server.arbiter, self._server.sshd
         self.robot = Path(tempfile.mkdtemp(prefix="vr"))
-        self.known_hosts = self.robot / "known_hosts"
+        self.known_hosts = self.robot / "config/vram-arbiter/known_hosts"
         self._keepers: list[subprocess.Popen[str]] = []
 
     def __enter__(self) -> Self:
         self.sshd.__enter__()
+        self.known_hosts.parent.mkdir(parents=True)
         self.known_hosts.write_text(self.sshd.host_key_line + "\n")
         self.authorize()
         return self
@@ -43,6 +44,11 @@ class Remote:
     def authorize(self, *doors: int) -> None:
         """Let the robot's key in, also to ports of doors."""
         self._server.authorize(USER, "grab", doors=doors)
+
+    @property
+    def sidecar(self) -> Path:
+        """The socket of `grab` on the server; its own group is the test's."""
+        return self.arbiter.runtime / "grab.sock"
 
     @property
     def host(self) -> str:
@@ -62,14 +68,17 @@ class Remote:
     def environ(self) -> dict[str, str]:
         """Of the robot's programs."""
         kept = {k: v for k, v in os.environ.items() if not k.startswith("VRAM_ARBITER_")}
-        return kept | {"VRAM_ARBITER_RUNTIME": str(self.robot), "PYTHONUNBUFFERED": "1"}
+        own = {
+            "VRAM_ARBITER_RUNTIME": str(self.robot),
+            "XDG_CONFIG_HOME": str(self.robot / "config"),
+        }
+        return kept | own
 
     def keeper(self, *arguments: str, host: str = "") -> subprocess.Popen[str]:
         """Start `vramctl remote up`."""
         command = [sys.executable, "-m", "vram_arbiter.clients", "remote", "up"]
         command += [host or self.host, *arguments]
         command += ["--server-runtime", str(self.arbiter.runtime)]
-        command += ["--known-hosts", str(self.known_hosts)]
         command += ["--identity", str(self.sshd.key(USER))]
         started = subprocess.Popen(command, env=self.environ, stderr=subprocess.PIPE, text=True)
         self._keepers.append(started)

@@ -93,11 +93,11 @@ def test_a_refusal_ends_the_keeper_with_its_reason(remote: Remote) -> None:
         return line
 
     assert "vramctl remote authorize" in refused(host=f"arm2@127.0.0.1:{remote.sshd.port}")
-    assert "ssh-keyscan -p" in refused(host=f"{USER}@localhost:{remote.sshd.port}")
+    assert "host key is known for" in refused(host=f"{USER}@localhost:{remote.sshd.port}")
     assert "grab is not served there" in refused("grab")
 
     remote.sshd.authorized(USER).write_text(f"restrict {remote.sshd.public_key(USER)}\n")
-    assert "may its key forward" in refused()
+    assert "may this key and this user" in refused()
     assert any("refused streamlocal" in said for said in remote.sshd.log)
     remote.authorize()
 

@@ -6,6 +6,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 from tests.runner.small_robots import robot_of
+from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.sidecar import npy
 from vram_arbiter.runner.protocols import Act, Done, StepOutcome
@@ -143,6 +144,19 @@ class Sidecar:
         if "id" in message:
             reply["re"] = message["id"]
         await self.server.send(peer, reply)
+
+
+class Leased(Sidecar):
+    """Its model has a lease at the server's arbiter."""
+
+    lease: AsyncLease
+
+    async def handle(self, peer: Peer, message: Message) -> None:
+        if message["endpoint"] == "load":
+            told = {"lease_id": self.lease.lease_id, "token": list(self.lease.token)}
+            await self.server.send(peer, {"re": message["id"], "ok": True, "loaded": True, **told})
+        else:
+            await super().handle(peer, message)
 
 
 class Use:
