@@ -224,7 +224,7 @@ def test_the_command_line_shows_all_boxes(boxes: Boxes, fleet: Fleet) -> None:
         assert "\n2. n1: it fits: " in told
         code, told = run("why", "waiting")
         assert code == 0
-        assert told.startswith("n0:\n  waiting ")
+        assert told.startswith("n0:\n  waiting: it is resident, ")
         assert run("why", "nobody")[0] == 1
 
 
