@@ -154,9 +154,8 @@ def _why(fleet: "Fleet", args: argparse.Namespace) -> int:
 
 # -- place
 def _place(fleet: "Fleet", args: argparse.Namespace) -> int:
-    names = fleet.boxes()
     ranked = fleet.order(args.vram, args.model)
-    order = [asdict(one) | {"box": names.get(one.node, one.node)} for one in ranked]
+    order = [asdict(one) for one in ranked]
     _show(args, {"order": order}, _place_lines(order, args.model))
     return OK if any(one.usable for one in ranked) else NO
 

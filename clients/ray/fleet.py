@@ -4,6 +4,7 @@ by it. Ray runs and restarts actors; each box's arbiter decides what its GPU hol
 
 import contextlib
 import ipaddress
+import logging
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -29,6 +30,7 @@ START_S: Final = 60.0
 CONNECT_S: Final = 3.0
 SLIVER: Final = 0.001
 """Of a node's marker, which any number of actors share."""
+log = logging.getLogger(__name__)
 
 
 class Fleet:
@@ -105,7 +107,9 @@ class Fleet:
     def order(self, need_bytes: int, model: str) -> list[Ranked]:
         """Return all boxes, best first, those of no use last, each with its reason. Raises
         VramInsufficient for a need beyond every budget."""
-        return placement.rank(self.views(), need_bytes, model, time.monotonic(), self._rng)
+        names = self.boxes()
+        ranked = placement.rank(self.views(), need_bytes, model, time.monotonic(), self._rng)
+        return [replace(one, box=names.get(one.node, one.node)) for one in ranked]
 
     # -- actors
     def spread(
@@ -118,9 +122,10 @@ class Fleet:
     ) -> list[Any]:
         """Start `per_node` actors on each node and return their handles at once, best node first.
 
-        A `@leased` class goes to all boxes whose arbiter answers and whose budget suffices; another
-        class goes to all nodes, each of its actors with the CPUs that Ray counts for it. `nodes`:
-        ids to use instead. Ray restarts the dead, elsewhere if their node died.
+        A `@leased` class goes to all boxes whose arbiter answers and whose budget suffices, and a
+        warning names the others; another class goes to all nodes, each of its actors with the CPUs
+        that Ray counts for it. `nodes`: ids to use instead. Ray restarts the dead, elsewhere if
+        their node died.
 
         Raises: BadRequest, NotPermitted, VramInsufficient, and Refused if no box may be used.
         """
@@ -128,6 +133,8 @@ class Fleet:
         if nodes is None and spec is not None:
             ranked = self.order(spec.need_bytes, spec.model)
             nodes = [one.node for one in ranked if one.usable]
+            for one in ranked[len(nodes) :]:
+                log.warning("no actor on %s: %s", one.box, one.reason)
             if not nodes:
                 raise _no_box(spec, {one.node: one.reason for one in ranked})
         return [

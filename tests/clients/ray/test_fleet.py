@@ -138,7 +138,9 @@ def test_a_killed_agent_is_started_again(boxes: Boxes, fleet: Fleet) -> None:
 
 
 @raylets
-def test_a_frozen_agent_leaves_its_box_unknown(boxes: Boxes, fleet: Fleet) -> None:
+def test_a_frozen_agent_leaves_its_box_unknown(
+    boxes: Boxes, fleet: Fleet, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     node = boxes.nodes[1].node_id
     pid = agent_pid(node)
     os.kill(pid, signal.SIGSTOP)
@@ -146,7 +148,9 @@ def test_a_frozen_agent_leaves_its_box_unknown(boxes: Boxes, fleet: Fleet) -> No
         assert known(fleet, node) is None
         with Fleet() as another:  # which does not wait for it as for one that starts
             places = {one.node: one.reason for one in another.order(GIB, "pi0")}
+            assert len(another.spread(Player, str(tmp_path), 0.0)) == 1
         assert places == {boxes.nodes[0].node_id: Reason.FREE, node: Reason.UNKNOWN}
+        assert "no actor on n1: unknown" in caplog.text
     finally:
         os.kill(pid, signal.SIGCONT)
     until(lambda: known(fleet, node) is not None)
@@ -220,7 +224,7 @@ def test_the_command_line_shows_all_boxes(boxes: Boxes, fleet: Fleet) -> None:
         assert "\n2. n1: it fits: " in told
         code, told = run("why", "waiting")
         assert code == 0
-        assert told.startswith("n0:\n  waiting ")
+        assert told.startswith("n0:\n  waiting: it is resident, ")
         assert run("why", "nobody")[0] == 1
 
 
