@@ -21,9 +21,10 @@ COLUMNS = ("world", "contestant", "success", "95 % interval", "steps", "errors")
 
 def write_report(args: argparse.Namespace, cells: Sequence[Cell], *, complete: bool) -> None:
     """Write the cells whole or not at all, after every cell. Raises ConfigError."""
+    last = args.seed + args.episodes - 1
     about = {
         "complete": complete,
-        "seeds": (args.seed, args.seed + args.episodes - 1),
+        "seeds": (args.seed, last),
         "max_steps": args.max_steps,
         "latency": "real time" if args.real_time else args.latency_steps,
     }
@@ -34,7 +35,7 @@ def write_report(args: argparse.Namespace, cells: Sequence[Cell], *, complete: b
     report = {"format": "vram-benchmark/3", **about, "cells": told}
     try:
         replace(args.out / REPORT, json.dumps(report, indent=1) + "\n")
-        replace(args.out / PAGE, page(about, cells))
+        replace(args.out / PAGE, page(about | {"seeds": f"{args.seed} to {last}"}, cells))
     except OSError as error:
         raise ConfigError(f"{args.out} cannot be written: {error}") from error
 
