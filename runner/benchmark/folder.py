@@ -8,11 +8,11 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from vram_arbiter.clients.cli.files import replace
 from vram_arbiter.clients.results import commit, committed
 from vram_arbiter.runner.benchmark.entries import VIDEOS, Entry
 from vram_arbiter.runner.benchmark.outcomes import Cell, SeedOutcome
@@ -21,6 +21,7 @@ from vram_arbiter.schemas.plain import JsonMap, JsonObject
 
 RUN = "run.json"
 RESULTS = "results"
+ANOTHER = "name another --out, or remove that folder"
 NUMBERS = ("task", "seed", "episodes", "max_steps", "latency_steps", "real_time")
 """Flags that results follow from, as they are."""
 
@@ -44,20 +45,21 @@ def claim(out: Path, flags: JsonMap) -> None:
 
     Raises ConfigError where it is of other flags, or cannot be written.
     """
-    path = out / RUN
-    beside = path.with_suffix(f".{os.getpid()}")
+    path, differing = out / RUN, list[str]()
     try:
-        beside.write_text(json.dumps(flags, indent=1) + "\n", encoding="utf-8")
-        try:
-            if not any((out / RESULTS).glob("*/*.json")):
-                path.unlink(missing_ok=True)  # nothing follows from its flags
-            os.link(beside, path)
-        except FileExistsError:
-            _compare(path, flags)
-        finally:
-            beside.unlink()
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be written: {error}") from error
+        if any((out / RESULTS).glob("*/*.json")):
+            earlier = json.loads(path.read_text(encoding="utf-8"))
+            differing = [
+                f"{name} {json.dumps(earlier[name])}, not {json.dumps(value)}"
+                for name, value in flags.items()
+                if earlier[name] != value
+            ]
+        else:
+            replace(path, json.dumps(flags, indent=1) + "\n")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} is not of a run: {error}", hint=ANOTHER) from error
+    if differing:
+        raise ConfigError(f"{out} has results of another run: {'; '.join(differing)}", hint=ANOTHER)
 
 
 def take_up(out: Path, cell: Cell, seeds: Iterable[int]) -> list[int]:
@@ -96,23 +98,6 @@ def tidy(out: Path) -> None:
     """Remove the videos of episodes that did not end."""
     for path in (out / VIDEOS).glob(".*.mp4"):
         path.unlink(missing_ok=True)
-
-
-def _compare(path: Path, flags: JsonMap) -> None:
-    try:
-        earlier = json.loads(path.read_text(encoding="utf-8"))
-        differing = [name for name in flags if earlier.get(name) != flags[name]]
-    except (ValueError, AttributeError) as error:
-        raise ConfigError(f"{path} does not describe a run: {error}") from None
-    if differing:
-        told = "; ".join(
-            f"{name} {json.dumps(earlier.get(name))}, not {json.dumps(flags[name])}"
-            for name in differing
-        )
-        raise ConfigError(
-            f"{path.parent} has results of another run: {told}",
-            hint="name another --out, or remove that folder",
-        )
 
 
 def _digest(path: Path) -> str | None:

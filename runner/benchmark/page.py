@@ -75,7 +75,7 @@ def _seed(played: SeedOutcome) -> str:
     numbers = (played.steps, played.standing_steps, f"{played.seconds:.1f}")
     return (
         f'<tr><td class="number">{played.seed}</td>'
-        f'<td class="{played.verdict}">{played.verdict}{" (cut off)" * played.truncated}</td>'
+        f'<td class="{played.verdict}">{played.verdict}</td>'
         + "".join(f'<td class="number">{number}</td>' for number in numbers)
         + f"<td>{escape(played.node)}</td><td>{video}</td><td>{escape(told)}</td></tr>"
     )

@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import os
 from collections.abc import Sequence
-from pathlib import Path
 
+from vram_arbiter.clients.cli.files import replace
 from vram_arbiter.runner.benchmark.outcomes import Cell
 from vram_arbiter.runner.benchmark.page import interval_of, page, rate_of
 from vram_arbiter.schemas.errors import ConfigError
@@ -22,9 +21,10 @@ COLUMNS = ("world", "contestant", "success", "95 % interval", "steps", "errors")
 
 def write_report(args: argparse.Namespace, cells: Sequence[Cell], *, complete: bool) -> None:
     """Write the cells whole or not at all, after every cell. Raises ConfigError."""
+    last = args.seed + args.episodes - 1
     about = {
         "complete": complete,
-        "seeds": (args.seed, args.seed + args.episodes - 1),
+        "seeds": (args.seed, last),
         "max_steps": args.max_steps,
         "latency": "real time" if args.real_time else args.latency_steps,
     }
@@ -33,17 +33,11 @@ def write_report(args: argparse.Namespace, cells: Sequence[Cell], *, complete: b
         for cell in cells
     ]
     report = {"format": "vram-benchmark/3", **about, "cells": told}
-    _write(args.out / REPORT, json.dumps(report, indent=1) + "\n")
-    _write(args.out / PAGE, page(about, cells))
-
-
-def _write(target: Path, text: str) -> None:
-    beside = target.with_suffix(".new")
     try:
-        beside.write_text(text, encoding="utf-8")
-        os.replace(beside, target)
+        replace(args.out / REPORT, json.dumps(report, indent=1) + "\n")
+        replace(args.out / PAGE, page(about | {"seeds": f"{args.seed} to {last}"}, cells))
     except OSError as error:
-        raise ConfigError(f"{target} cannot be written: {error}") from error
+        raise ConfigError(f"{args.out} cannot be written: {error}") from error
 
 
 def table(cells: Sequence[Cell]) -> str:

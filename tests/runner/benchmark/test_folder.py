@@ -47,7 +47,7 @@ def test_a_folder_without_results_is_anyones(tmp_path: Path) -> None:
 def test_a_file_that_is_not_of_a_run_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / folder.RUN).write_text(text)
     commit(tmp_path / folder.RESULTS / cell().name, 0, {})
-    with pytest.raises(ConfigError, match="does not describe a run"):
+    with pytest.raises(ConfigError, match="is not of a run"):
         folder.claim(tmp_path, folder.flags_of(args(), []))
 
 
