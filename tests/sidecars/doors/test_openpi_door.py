@@ -1,18 +1,24 @@
 """openpi's stock client at a sidecar's door, unmodified."""
 
 import http.client
+import os
 import re
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import msgpack
 import pytest
 
 from tests.sidecars.doors.conftest import GRAB, KEY, PATIENCE_S, Served
+from tests.support.guests import USER
+from tests.support.process import Make
+from tests.support.remote import Remote, wait_for_line
 from tests.support.waiting import until
 from vram_arbiter.clients.sidecar import npy
+from vram_arbiter.schemas.runtime.ports import free_port
 from vram_arbiter.sidecars.doors.open import CONNECTIONS_MAX
 
 pytest.importorskip("openpi_client", reason="the dependency group `stock` is not installed")
@@ -32,8 +38,8 @@ def connect(door: Served) -> Iterator[Callable[..., Any]]:
 
     made: list[Any] = []
 
-    def connect(key: str | None = KEY) -> Any:
-        made.append(WebsocketClientPolicy("127.0.0.1", door.port, api_key=key))
+    def connect(key: str | None = KEY, port: int = door.port) -> Any:
+        made.append(WebsocketClientPolicy("127.0.0.1", port, api_key=key))
         return made[-1]
 
     yield connect
@@ -63,6 +69,23 @@ def native(door: Served, observation: dict[str, Any]) -> Any:
     data = npy.pack({"observation": ours})
     answer = door.ask(endpoint="get_action", whole_chunk=True, data=data)
     return npy.unpack(answer["action"])
+
+
+@pytest.mark.nightly
+def test_a_robot_reaches_the_door_through_its_tunnel(
+    connect: Callable[..., Any], door: Served, make_arbiter: Make, tmp_path: Path
+) -> None:
+    with Remote(make_arbiter, tmp_path) as remote:
+        remote.authorize(door.port)
+        # the door lets in whoever may open its socket: by the account, which sshd's namespace has
+        os.chown(door.arbiter.runtime / "second.openpi", remote.sshd.uid(USER), -1)
+        here = free_port()
+        keeper = remote.up("--door", f"{here}:{door.port}")
+        assert connect(port=here).infer(seen())["actions"].shape == (ROWS, JOINTS)
+
+        remote.sshd.kill(USER)
+        wait_for_line(keeper, "is up")
+        assert connect(port=here).infer(seen())["actions"].shape == (ROWS, JOINTS)
 
 
 def test_a_chunk_is_answered_and_played_row_by_row(
