@@ -71,16 +71,19 @@ class Boxes:
             wait([worker.close.remote().future() for worker in workers], CLOSE_S)
 
     def _able(self, workers: Sequence[Any], seeds: Sequence[int]) -> list[Any]:
-        """Wait for the first worker that can play, and leave out those that cannot. Raises
-        SeedsFailed for all seeds where none can.
+        """Wait for the first worker that can play, as long as for an episode, and leave out those
+        that cannot. Raises SeedsFailed for all seeds where none can.
         """
         begun = {worker.__ray_ready__.remote().future(): worker for worker in workers}
         failed, why = set[Any](), "no box"
-        for future in as_completed(begun):
-            if (error := future.exception()) is None:
-                return [worker for worker in workers if worker not in failed]
-            failed.add(begun[future])
-            why = str(error).strip().splitlines()[-1]  # behind where it was raised
+        try:
+            for future in as_completed(begun, self._deadline_s):
+                if (error := future.exception()) is None:
+                    return [worker for worker in workers if worker not in failed]
+                failed.add(begun[future])
+                why = str(error).strip().splitlines()[-1]  # behind where it was raised
+        except TimeoutError:
+            why = f"no box could begin within {self._deadline_s:g} s"
         raise SeedsFailed(why, details={"failed": dict.fromkeys(map(str, seeds), why)})
 
 

@@ -111,6 +111,26 @@ def test_without_a_box_that_can_play_seeds_are_errors(tmp_path: Path, run_async:
     assert told[0].message.startswith("ArbiterUnreachable: ")
 
 
+def test_boxes_that_never_begin_are_waited_for_as_long_as_an_episode(
+    tmp_path: Path, run_async: Any
+) -> None:
+    """The command waited for ever where the only box stood still."""
+
+    class Standing:
+        def __getattr__(self, method: str) -> Any:
+            future = Future[Any]()
+            if method == "close":
+                future.set_result(None)
+            return SimpleNamespace(remote=lambda: SimpleNamespace(future=lambda: future))
+
+    fleet: Any = SimpleNamespace(
+        boxes=lambda: {"id": "here"}, spread=lambda *args, **named: [Standing()]
+    )
+    told: list[SeedOutcome] = []
+    run_async(boxes.Boxes(fleet, [], 1, 0.01).play(0, [0], tmp_path, told.append))
+    assert told[0].message == "no box could begin within 0.01 s"
+
+
 def test_a_box_without_the_runs_folders_says_so(tmp_path: Path) -> None:
     argv = ["benchmark", "--policy", "random", "--out", str(tmp_path)]
     with pytest.raises(ConfigError, match="is not on this box"):
