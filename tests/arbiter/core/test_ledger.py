@@ -167,3 +167,21 @@ def test_bytes_of_a_process_in_a_reading() -> None:
     reading = sample(1.0, 500, (A, 300), (B, None), (ProcessKey(3, 0), 9))
     assert [bytes_of(reading, p) for p in (A, B, C, ProcessKey(4, 4))] == [300, None, 9, 0]
     assert bytes_of(MemorySampled(GPU, 1.0, 5, 10, None), A) is None
+
+
+def test_leases_that_leave_together_keep_the_largest_of_their_residues() -> None:
+    books = ledger()
+    books.charge(LA, A, 300, 300, 1.0)
+    books.charge(LA2, A, 200, 200, 1.0)
+    assert books.total_if({LA: 50, LA2: 20}) == books.total_if({LA: 20, LA2: 50}) == 50
+
+
+def test_while_the_drivers_own_bytes_were_never_seen_none_are_known() -> None:
+    books = ledger()
+    assert books.unlisted_bytes(sample(1.0, 150, (C, 100))) == 50, "another container's, maybe"
+
+
+def test_one_process_may_hold_the_whole_gpu() -> None:
+    books = ledger()
+    assert books.impossible(sample(1.0, 1000, (A, 1000))) == ""
+    assert books.impossible(sample(1.0, 1000, (A, 1100))) != ""

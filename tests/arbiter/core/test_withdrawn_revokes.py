@@ -57,6 +57,8 @@ def test_a_revoke_is_withdrawn_where_the_wait_times_out(driver: CoreDriver) -> N
     driver.until(lambda: driver.state(lease) == "revoking")
     driver.until(lambda: bool(driver.notes("denied")))
     assert driver.state(lease) == "held"
+    (note,) = driver.notes("revoke_withdrawn")
+    assert note["ms"] == pytest.approx(3000.0), "that long it was asked in vain"
 
 
 def test_a_revoke_is_withdrawn_where_other_room_came_first() -> None:

@@ -8,7 +8,13 @@ from tests.support.core_driver import CoreDriver
 from tests.support.scenes import held, in_use, shown, why
 from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.events import Asked
-from vram_arbiter.schemas.defaults import GIB, MIB, RESERVE_BYTES
+from vram_arbiter.schemas.defaults import (
+    GIB,
+    MIB,
+    RESERVE_BYTES,
+    REVOKE_DEADLINE_S,
+    VERIFY_TIMEOUT_S,
+)
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
 from vram_arbiter.schemas.wire.requests import Acquire
 
@@ -106,6 +112,7 @@ def test_why_follows_the_way_of_the_holder(driver: CoreDriver) -> None:
     det.hold(0)
     det.release(lease)
     says.append(why(driver, "vlm")["next"])
+    assert [b["condition"] for b in why(driver, "vlm")["blockers"]] == ["measured"]
     assert says == [
         "waits for det to finish 2 uses (revoked 0.1 s ago), then it unloads and 5.30 GiB are "
         "verified",
@@ -115,6 +122,26 @@ def test_why_follows_the_way_of_the_holder(driver: CoreDriver) -> None:
         "det unloads, then 5.30 GiB are verified",
         "5.30 GiB of det are being verified",
     ]
+
+
+def test_why_names_the_process_of_an_unload_that_hangs(driver: CoreDriver) -> None:
+    det, lease = held(driver, "det", 5)
+    driver.consumer("vlm").acquire(5 * GIB)
+    det.unloading(lease)
+    driver.advance(REVOKE_DEADLINE_S + 0.1)
+    (blocker,) = why(driver, "vlm")["blockers"]
+    assert (blocker["condition"], blocker["pid"]) == ("hanging", det.process.pid)
+
+
+def test_why_keeps_a_late_verdict_on_a_dead_process_apart_from_a_living_one() -> None:
+    driver = CoreDriver(8 * GIB)
+    driver.device.lag_s = 60.0
+    det, _ = held(driver, "det", 5)
+    det.die()
+    driver.consumer("vlm").acquire(5 * GIB)
+    driver.advance(VERIFY_TIMEOUT_S + 1.0)
+    (blocker,) = why(driver, "vlm")["blockers"]
+    assert (blocker["state"], blocker["condition"]) == ("debt", "debt")
 
 
 def test_why_says_who_is_pinned_idle_or_of_higher_priority() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import CoreDriver
-from tests.support.scenes import held, in_use
+from tests.support.scenes import held, in_use, why
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ProcessKey
@@ -60,6 +60,20 @@ def test_several_are_asked_together_when_the_last_of_them_may_be(driver: CoreDri
     assert steps[0]["in_s"] == steps[1]["in_s"]
     assert steps[0]["text"].endswith("when enough may be revoked together")
     assert steps[1]["text"].endswith("when its minimum residency ends")
+
+
+def test_beside_many_holders_the_one_that_can_make_room_is_found(driver: CoreDriver) -> None:
+    for number in range(30):
+        held(driver, f"pinned{number}", 0.1, evictable=False)
+    held(driver, "detector", 4, min_residency_s=60.0)
+    driver.consumer("w").acquire(4 * GIB)
+    assert (only(driver)["action"], only(driver)["consumer"]) == ("ask", "detector")
+
+
+def test_the_nearest_step_comes_first(driver: CoreDriver) -> None:
+    held(driver, "detector", 6, min_residency_s=5.0)
+    driver.consumer("w").acquire(4 * GIB, wait_timeout_s=2.0)
+    assert [step["action"] for step in plan(driver)] == ["give_up", "ask"]
 
 
 def test_nobody_is_asked_where_nobody_could_make_room(driver: CoreDriver) -> None:
@@ -192,6 +206,13 @@ def test_the_estimate_counts_those_who_will_be_asked() -> None:
     unknown.consumer("w").acquire(4 * GIB)
     (entry,) = unknown.why("w")["leases"]
     assert (entry["eta_s"], entry["eta_source"]) == (None, "none")
+
+
+def test_there_is_no_estimate_where_nobody_will_be_asked() -> None:
+    driver = CoreDriver(settings={"learnt": {"w": {"load_s": 3.0}}})
+    held(driver, "pinned", 6, evictable=False)
+    driver.consumer("w").acquire(4 * GIB)
+    assert why(driver, "w")["eta_s"] is None
 
 
 def test_a_resident_lease_has_no_plan(driver: CoreDriver) -> None:

@@ -145,3 +145,12 @@ def test_details_say_what_why_says(driver: CoreDriver) -> None:
     assert vlm["why"]["text"] == behind["text"]
     assert (vlm["why"]["eta_s"], vlm["why"]["plan"]) == (behind["eta_s"], behind["plan"])
     assert not vlm["why"]["blockers"], "the blockers are the head's"
+
+
+def test_waiters_follow_the_holders_page_where_their_rank_is_below_zero() -> None:
+    """Soon after boot the clock shows fewer seconds than a priority is worth."""
+    driver = CoreDriver(8 * GIB, settings={"ageing_s_per_point": 100.0})
+    driver.consumer("holder").acquire(7 * GIB)
+    driver.consumer("urgent").acquire(5 * GIB, priority=90)
+    found = [view["consumer"] for page in pages(driver, 1) for view in page]
+    assert found == ["holder", "urgent"]

@@ -4,7 +4,7 @@ nobody is granted before."""
 from typing import Any
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.scenes import give_back
+from tests.support.scenes import give_back, why
 from vram_arbiter.arbiter.core.effects import Note, Push
 from vram_arbiter.arbiter.core.events import (
     Asked,
@@ -270,6 +270,32 @@ def test_a_revoke_goes_to_the_connection_that_reattached(driver: CoreDriver) -> 
     driver.until(lambda: driver.state(lease) == "revoking")
     pushed = [e for e in driver.effects if isinstance(e, Push)]
     assert [(e.client, e.body.TAG[1]) for e in pushed] == [(det.client, "revoke")]
+
+
+def test_a_use_keeps_its_label_when_its_holder_comes_back(driver: CoreDriver) -> None:
+    """By another connection of the same instance: nobody said that the one before is gone."""
+    det, lease, token = held_with_token(driver, "det", 5)
+    det.use_begin(lease, label="grab")
+    before, det.client = det.client, ClientId("back")
+    instance = f"det-{before}"
+    driver.post(ClientConnected(det.client, det.process, det.uid, "det", instance))
+    det.reattach(lease, token, uses=("u1",))
+    driver.consumer("vlm").acquire(5 * GIB)
+    assert 'finish 1 use "grab"' in why(driver, "vlm")["next"]
+
+
+def test_what_a_process_keeps_beyond_its_context_comes_back_after_a_restart_too() -> None:
+    driver = CoreDriver(8 * GIB)
+    det, lease, _ = held_with_token(driver, "det", 5, residue_bytes=450 * MIB)
+    det.unloading(lease)
+    det.release(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    driver.restart()
+    det.connect()
+    assert driver.gpu()["charged_bytes"] == 5 * GIB
+    det.hold(450 * MIB)
+    driver.consumer("w").acquire(5 * GIB)
+    driver.until(lambda: driver.gpu()["charged_bytes"] == 5 * GIB + 450 * MIB, limit_s=3.0)
 
 
 def test_verifications_and_debts_go_on_after_the_restart(driver: CoreDriver) -> None:

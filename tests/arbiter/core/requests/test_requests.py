@@ -175,7 +175,8 @@ def test_cancel_gives_up_a_wait_and_may_be_repeated(driver: CoreDriver) -> None:
 def test_only_the_holder_with_the_exact_token_is_heard(driver: CoreDriver) -> None:
     det, vlm = driver.consumer("det"), driver.consumer("vlm")
     lease = det.acquire(5 * GIB)
-    assert refusal(vlm.ready(lease)).code == "not_permitted"
+    denied = refusal(vlm.ready(lease))
+    assert (denied.code, denied.details["pid"]) == ("not_permitted", det.process.pid)
     assert refusal(det.release(lease, token=Token(1, 99))).code == "stale_token"
     queued = vlm.acquire(5 * GIB)
     assert refusal(vlm.release(queued, token=Token(1, 99))).code == "bad_state"

@@ -270,3 +270,14 @@ def test_whoever_says_bye_and_lives_on_keeps_its_context(driver: CoreDriver) -> 
     det.leave()
     driver.until(lambda: driver.state(lease) == "over", limit_s=1.0)
     assert driver.gpu()["charged_bytes"] == 450 * MIB
+
+
+def test_a_client_that_only_uses_anothers_lease_is_a_concern(driver: CoreDriver) -> None:
+    """Whoever is none is forgotten as soon as its connection is lost, and its uses end."""
+    det, lease = held(driver, "det", 5)
+    runner = driver.consumer("runner")
+    assert not driver.arbiter.concerns(runner.client)
+    runner.use_begin(lease, "goal", det.token(lease))
+    assert driver.arbiter.concerns(runner.client)
+    runner.use_end(lease, "goal", det.token(lease))
+    assert not driver.arbiter.concerns(runner.client)

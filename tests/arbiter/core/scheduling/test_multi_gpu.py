@@ -145,6 +145,20 @@ def test_what_fits_beside_the_head_that_is_placed_elsewhere_is_granted(driver: C
     assert (place(driver, other), driver.state(head)) == (ONE, "queued")
 
 
+def test_the_head_that_gets_a_place_elsewhere_lets_those_behind_it_proceed_at_once() -> None:
+    driver = CoreDriver(8 * GIB, gpus=2)
+    first, a = in_use(driver, "a", 6, gpu="0", priority=90)
+    in_use(driver, "b", 4, gpu="1", priority=90)
+    head = driver.consumer("head").acquire(6 * GIB)
+    other = driver.consumer("other").acquire(int(3.5 * GIB), gpu="1")
+    driver.advance(0.5)
+    assert driver.state(other) == "queued", "the head may come to either GPU"
+    first.use_end(a)
+    assert driver.state(a) == "revoking"
+    driver.advance(0.01)
+    assert (driver.state(other), driver.state(head)) == ("loading", "queued")
+
+
 def test_two_heads_that_are_placed_elsewhere_leave_the_gpu_to_nobody(driver: CoreDriver) -> None:
     first, a = held(driver, "a", 3, gpu="0", priority=10)
     second, b = held(driver, "b", 3, gpu="0", priority=10)

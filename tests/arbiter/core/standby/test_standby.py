@@ -38,7 +38,8 @@ def test_what_standby_looks_like(driver: CoreDriver) -> None:
     assert (view["gpu"], view["charge_bytes"], view["uses"]) == (None, 0, 0)
     assert "ttl_left_s" not in view
     assert "position" not in view
-    assert driver.notes("standby")[-1]["left_for"] == "policy"
+    note = driver.notes("standby")[-1]
+    assert (note["left_for"], note["parked_bytes"]) == ("policy", 0)
     assert driver.arbiter.inspect().leases[lease].story[-1][2] == "verified"
     driver.advance(600.0)
     assert driver.state(lease) == "standby", "nobody has to renew it"

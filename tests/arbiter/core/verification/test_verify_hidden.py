@@ -153,6 +153,20 @@ def test_one_that_comes_onto_the_list_has_not_grown(driver: CoreDriver) -> None:
     assert driver.gpu()["charged_bytes"] == 6 * GIB
 
 
+def test_one_that_comes_onto_the_list_below_its_charge_has_not_grown(driver: CoreDriver) -> None:
+    """The ledger has room for what the dead one still holds: only the total from before tells."""
+    driver.device.unlisted.add(ProcessKey(101, 707))
+    other, _ = held(driver, "other", 4)
+    other.hold(2 * GIB)
+    det, _ = held(driver, "det", 2)
+    driver.advance(1.5)
+    driver.device.lag_s = 60.0
+    driver.device.unlisted ^= {other.process, det.process}
+    det.die()
+    driver.advance(11.0)
+    assert driver.gpu()["charged_bytes"] == 6 * GIB
+
+
 def test_one_that_comes_onto_the_list_by_its_load_has_grown(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 3)
     change_places(driver, det, lease)
