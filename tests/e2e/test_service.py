@@ -27,6 +27,7 @@ from tests.support.wire import WireClient
 pytestmark = pytest.mark.e2e
 PATIENCE_S = 60
 GIB = 1 << 30
+NOBODYS_GID = 1  # `daemon` or `bin`, which no user is in
 TREE = Path(__file__).parents[2]
 UNIT = TREE / "configs" / "systemd" / "system" / "vram-arbiter.service"
 
@@ -63,9 +64,10 @@ class Service(ArbiterProcess):
             line.removeprefix("ExecStart=").replace("$ARBITER_OPTIONS", self.options)
         )
         assert Path(words[0]).name == "vram-arbiter"
-        named = [
-            self.group if word in ("vram-arbiter", "vram-operators") else word for word in words[1:]
-        ]
+        # of this machine: no holder here is a guest
+        groups = dict.fromkeys(("vram-arbiter", "vram-operators"), self.group)
+        groups["vram-guests"] = grp.getgrgid(NOBODYS_GID).gr_name
+        named = [groups.get(word, word) for word in words[1:]]
         return [*self.wrapper, sys.executable, "-m", "vram_arbiter.arbiter", *named, *more]
 
 

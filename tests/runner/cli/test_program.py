@@ -118,7 +118,7 @@ def test_wrong_flags_are_usage_errors(capsys: pytest.CaptureFixture[str]) -> Non
         (["--sidecar", "=ipc:///x"], "RSKILL=ENDPOINT"),
         (
             ["--sidecar", "vram-arbiter/so101-grap=ipc:///x"],
-            "--sidecar vram-arbiter/so101-grap: no such policy",
+            "no such policy or detector is installed: vram-arbiter/so101-grap",
         ),
         (["--skills", "/nonexistent"], "cannot be read"),
     ],
