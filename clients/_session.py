@@ -394,7 +394,7 @@ class Session:
                 self._greeted.set(None)
             case r.ContactLost():
                 self._note_lost_contact(event.reason)
-            case r.Refused():
+            case r.GreetingRefused():
                 if self._greeted.done:
                     log.warning("the arbiter refuses this client: %s", event.error)
                 self._greeted.fail(event.error)

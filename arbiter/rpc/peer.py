@@ -1,5 +1,5 @@
-"""What a peer may be: visible, and perhaps an operator or a guest. Which process it is says the kernel
-(`schemas.runtime.peercred`).
+"""What a peer may be: visible, and perhaps an operator or a guest. Which process it is says the
+kernel (`schemas.runtime.peercred`).
 
 Must not know sessions or requests.
 """

@@ -18,9 +18,9 @@ from vram_arbiter.clients._protocol.records import (
     ContactLost,
     Event,
     Failed,
+    GreetingRefused,
     OnError,
     Pending,
-    Refused,
     Replied,
     Up,
 )
@@ -69,8 +69,8 @@ class Above(Protocol):
 
 
 class Connection:
-    """`phase`, what the arbiter said (`epoch`, `role`, `heartbeat_s`, `grace_s`), and what its owner
-    takes: `outgoing` messages and `events`."""
+    """`phase`, what the arbiter said (`epoch`, `role`, `heartbeat_s`, `grace_s`), and what its
+    owner takes: `outgoing` messages and `events`."""
 
     def __init__(self, above: Above, *, name: str, instance: str, role: w.Role) -> None:
         self.instance = instance
@@ -239,7 +239,7 @@ class Connection:
             if isinstance(error, UnknownSession):
                 self.contact_lost("the arbiter forgot the session")
                 return
-            self.events.append(Refused(error))
+            self.events.append(GreetingRefused(error))
             self._phase_deadline = now + REFUSED_RETRY_S
             return
         if self.phase == "greeting":

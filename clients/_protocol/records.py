@@ -61,7 +61,7 @@ class ContactLost:
 
 
 @dataclass(frozen=True, slots=True)
-class Refused:
+class GreetingRefused:
     """The arbiter refuses this client (version, role, limit)."""
 
     error: VramError
@@ -146,7 +146,7 @@ class PrepareAsked:
 Event = (
     Up
     | ContactLost
-    | Refused
+    | GreetingRefused
     | Replied
     | Failed
     | Granted

@@ -28,7 +28,7 @@ def _of(pattern: str, what: str) -> Callable[[str], str]:
     return check
 
 
-# of a robot's, `vram-` before it makes a Unix user's; neither may have what the key's line separates
+# of a robot's, `vram-` before it makes a Unix user's; neither may have what the key's line parts
 _NAME = _of(r"[a-z][a-z0-9_-]{0,26}", "at most 27 of a-z, 0-9, _ and -, a letter first")
 _SIDECAR = _of(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}", "the name of a sidecar")
 _PORT = count(1, 65535)

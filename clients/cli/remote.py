@@ -75,7 +75,8 @@ def _door(written: str) -> tuple[int, int]:
 
 
 def _up(args: argparse.Namespace) -> int:
-    """Keep the tunnel until SIGTERM or SIGINT. Raises RemoteRefused, ConfigError, AlreadyRunning."""
+    """Keep the tunnel until SIGTERM or SIGINT. Raises RemoteRefused, ConfigError,
+    AlreadyRunning."""
     settings = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
     tunnel = ssh.Tunnel(
         args.host,

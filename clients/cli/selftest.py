@@ -13,7 +13,7 @@ from vram_arbiter.clients.cli.replies import NO, OK
 from vram_arbiter.clients.selftest import report
 from vram_arbiter.clients.selftest.bed import READING_S, answered_within
 from vram_arbiter.clients.selftest.rows import ROWS
-from vram_arbiter.clients.selftest.run import Order, Result, selftest
+from vram_arbiter.clients.selftest.run import Outcome, Trial, selftest
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.printable import printable
@@ -58,9 +58,9 @@ def run(args: argparse.Namespace) -> int:
     return OK if all(one.verdict in ("pass", "skipped") for one in results) else NO
 
 
-async def _run(args: argparse.Namespace) -> list[Result]:
+async def _run(args: argparse.Namespace) -> list[Outcome]:
     index, why = await _index(args.gpu)
-    simulated, gpus, results = index is None, list[Gpu](), list[Result]()
+    simulated, gpus, results = index is None, list[Gpu](), list[Outcome]()
 
     def begun(gpu: Gpu) -> None:
         gpus.append(gpu)
@@ -68,13 +68,13 @@ async def _run(args: argparse.Namespace) -> list[Result]:
         if simulated:
             print(printable(f"{report.SIMULATED} ({why})"), flush=True)
 
-    def tell(result: Result) -> None:
+    def tell(result: Outcome) -> None:
         results.append(result)
         line = report.line_of(result, simulated=simulated)
         print("\n".join(terminal.folded(line, 4, terminal.columns())), flush=True)
 
     rows = [row for row in ROWS if args.row is None or row.id in args.row]
-    await selftest(Order(index, args.memory, args.within, rows), begun, tell)
+    await selftest(Trial(index, args.memory, args.within, rows), begun, tell)
     told = report.told(gpus[0], results, simulated=simulated)
     print(told["summary"])
     for place, written in ((args.json, report.as_json), (args.report, report.as_markdown)):

@@ -20,7 +20,7 @@ from vram_arbiter.clients.ray.mapping import Result, map_results
 from vram_arbiter.clients.ray.placement import Ranked, View
 from vram_arbiter.clients.ray.residency import Refused
 from vram_arbiter.schemas.errors import ArbiterUnreachable, BadRequest, ConfigError, NotPermitted
-from vram_arbiter.schemas.plain import JsonMap, Message
+from vram_arbiter.schemas.plain import JsonMap, JsonObject, Message
 from vram_arbiter.schemas.runtime.extras import need
 
 ANSWER_S: Final = 1.0
@@ -263,13 +263,13 @@ def _token_auth() -> bool:
 
 
 # -- Ray
-def _options(cls: Any) -> tuple[LeasedSpec | None, dict[str, Any]]:
+def _options(cls: Any) -> tuple[LeasedSpec | None, JsonObject]:
     """Return what a class leases, and the options of its actors. Raises BadRequest for resources
     beside a lease."""
     made = getattr(getattr(cls, "__ray_metadata__", None), "modified_class", cls)
     given = dict(getattr(cls, "_default_options", {}))
     spec: LeasedSpec | None = getattr(made, "leased", None)
-    options: dict[str, Any] = {"max_restarts": -1}
+    options: JsonObject = {"max_restarts": -1}
     if spec is not None:
         refuse_resources(name for name in ("num_gpus", "accelerator_type") if given.get(name))
         refuse_resources(given.get("resources") or {})
@@ -278,9 +278,7 @@ def _options(cls: Any) -> tuple[LeasedSpec | None, dict[str, Any]]:
     return spec, options
 
 
-def _start(
-    cls: Any, options: dict[str, Any], node: str, args: Sequence[Any], named: dict[str, Any]
-) -> Any:
+def _start(cls: Any, options: JsonObject, node: str, args: Sequence[Any], named: JsonObject) -> Any:
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 

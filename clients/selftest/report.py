@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Final
 
 from vram_arbiter.clients.calibration.gpu import Gpu
-from vram_arbiter.clients.selftest.run import Result, Verdict
+from vram_arbiter.clients.selftest.run import Outcome, Verdict
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
@@ -19,7 +19,7 @@ SIMULATED: Final = "SIMULATED GPU: the programs are tested, no claim about hardw
 PACKAGES: Final = ("vram-arbiter", "torch", "transformers", "lerobot", "bitsandbytes")
 
 
-def line_of(result: Result, *, simulated: bool) -> str:
+def line_of(result: Outcome, *, simulated: bool) -> str:
     """Return a result as one line. A mark in brackets is of a simulated GPU."""
     passed, mark = result.verdict == "pass", MARKS[result.verdict]
     mark = f"({mark})" if simulated and passed else f" {mark} "
@@ -27,21 +27,21 @@ def line_of(result: Result, *, simulated: bool) -> str:
     return printable(f"{mark} {result.id:<14}{_figure(result):>14}  {result.limit:<16}  {remark}")
 
 
-def _figure(result: Result) -> str:
+def _figure(result: Outcome) -> str:
     if result.figure is None:
         return ""
     form = ".0f" if abs(result.figure) >= 100 else ".3g"
     return f"{result.figure:{form}} {result.unit}".rstrip()
 
 
-def summary_of(results: Sequence[Result], *, simulated: bool) -> str:
+def summary_of(results: Sequence[Outcome], *, simulated: bool) -> str:
     """Return the number of rows by verdict."""
     counts = Counter(one.verdict for one in results)
     said = ", ".join(f"{counts[one]} {one}" for one in MARKS if counts[one])
     return f"{said} ({SIMULATED})" if simulated else said
 
 
-def told(gpu: Gpu, results: Sequence[Result], *, simulated: bool) -> JsonMap:
+def told(gpu: Gpu, results: Sequence[Outcome], *, simulated: bool) -> JsonMap:
     """Return machine and rows as a map; nothing in it names the machine or a user."""
     machine = {
         "gpu": gpu.name, "memory": format_bytes(gpu.total_bytes), "driver": gpu.driver,

@@ -36,7 +36,7 @@ SIMULATED: Final = "fake:8GiB"
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class Trial:
     """What is asked for. `index` None: a simulated GPU."""
 
     index: int | None
@@ -46,7 +46,7 @@ class Order:
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class Outcome:
     """What a row found. `figure` None: none was measured; `limit` "": it has none here."""
 
     id: str
@@ -61,7 +61,7 @@ class Result:
 
 
 async def selftest(
-    wanted: Order, begun: Callable[[Gpu], None], tell: Callable[[Result], None]
+    wanted: Trial, begun: Callable[[Gpu], None], tell: Callable[[Outcome], None]
 ) -> None:
     """Measure all rows, and tell each result as it comes; `begun` is told the GPU before.
 
@@ -79,7 +79,7 @@ async def selftest(
 
 
 @asynccontextmanager
-async def _made(wanted: Order, folder: str) -> AsyncIterator[Bed]:
+async def _made(wanted: Trial, folder: str) -> AsyncIterator[Bed]:
     """Read the GPU, and start a daemon on it; end that and all other children with the block."""
     gpu, found = await _open(wanted)
     endpoint = f"ipc://{folder}/arbiter.sock"
@@ -106,7 +106,7 @@ async def _made(wanted: Order, folder: str) -> AsyncIterator[Bed]:
         await programs.stop_all()
 
 
-async def _open(wanted: Order) -> tuple[Gpu | None, Reading | None]:
+async def _open(wanted: Trial) -> tuple[Gpu | None, Reading | None]:
     """Open a real GPU and read it, if it may be used; the daemon makes a simulated one. Raises
     ConfigError, NoGpu, ProbeFailed."""
     if wanted.index is None:
@@ -160,14 +160,14 @@ async def room_on(client: AsyncClient, gpu: str) -> int:
         await asyncio.sleep(BEAT_S)
 
 
-async def judged(row: Claim, bed: Bed, left_s: float) -> Result:
+async def judged(row: Claim, bed: Bed, left_s: float) -> Outcome:
     """Measure one row in `left_s` at most. Never raises: a row that fails hides no other."""
     limit = "" if row.timed_model and bed.simulated else row.limit
     began_s, limit_s = time.monotonic(), min(row.limit_s, left_s)
 
-    def result(verdict: Verdict, remark: str, figure: float | None = None) -> Result:
+    def result(verdict: Verdict, remark: str, figure: float | None = None) -> Outcome:
         seconds, of = round(time.monotonic() - began_s, 3), (row.unit, limit, row.source)
-        return Result(row.id, row.what, figure, *of, verdict, remark, seconds)
+        return Outcome(row.id, row.what, figure, *of, verdict, remark, seconds)
 
     try:
         if row.hardware and bed.simulated:

@@ -19,7 +19,7 @@ CLEARED: Final = "\r\x1b[K"
 log = logging.getLogger("runner")
 
 
-class Progress:
+class ProgressLine:
     """Of `episodes` that are left to play."""
 
     def __init__(self, episodes: int, clock: Callable[[], float] = time.monotonic) -> None:

@@ -18,7 +18,7 @@ from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.benchmark import folder
 from vram_arbiter.runner.benchmark.entries import SO101, VIDEOS, Entry, entries_of
 from vram_arbiter.runner.benchmark.outcomes import Cell, SeedOutcome, given_up
-from vram_arbiter.runner.benchmark.progress import Progress
+from vram_arbiter.runner.benchmark.progress import ProgressLine
 from vram_arbiter.runner.benchmark.report import MAX_STEPS, PAGE, REPORT, table, write_report
 from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.common import (
@@ -185,7 +185,7 @@ async def _play(
     cells = [entry.cell() for entry in entries]
     seeds = range(args.seed, args.seed + args.episodes)
     missing = [folder.take_up(args.out, cell, seeds) for cell in cells]
-    progress = Progress(sum(map(len, missing)))
+    progress = ProgressLine(sum(map(len, missing)))
 
     async def forward() -> None:
         await stopping.wait()

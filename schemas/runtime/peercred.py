@@ -1,8 +1,8 @@
 """The process at the other end of a unix socket, as the kernel names it.
 
-SO_PEERCRED and SO_PEERGROUPS hold the credentials of the moment of connecting. A pid alone is reused, so a pidfd is
-opened at once and the start time is read while the pidfd shows the process alive: the three name
-one process for ever.
+SO_PEERCRED and SO_PEERGROUPS hold the credentials of the moment of connecting. A pid alone is
+reused, so a pidfd is opened at once and the start time is read while the pidfd shows the process
+alive: the three name one process for ever.
 """
 
 import os

@@ -84,7 +84,7 @@ def test_decisions_are_titled_by_their_numbers() -> None:
 def test_every_sentence_of_the_design_records_has_one_place() -> None:
     """Code and its test, which `test_named_paths_exist` finds; a decision where it is missing."""
     text = (TREE / "docs/explanation/records.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^- \*\*([EVRC][\w–, -]+)\*\* (.+)$", text, re.MULTILINE)
+    rows = re.findall(r"^- \*\*([EVRC][\w–, -]+)\*\* (.+(?:\n  .+)*)$", text, re.MULTILINE)
     found: list[str] = []
     for sentences, place in rows:
         for letter, first, last in re.findall(r"([EVR])(\d+)(?:–\1(\d+))?", sentences):

@@ -35,7 +35,7 @@ def test_a_refused_hello_is_told_and_tried_again() -> None:
     link.connection.connected(link.now)
     link.refuse(link.one("hello"), "version_mismatch")
     (refused,) = link.told()
-    assert isinstance(refused, r.Refused)
+    assert isinstance(refused, r.GreetingRefused)
     assert isinstance(refused.error, VersionMismatch)
     link.tick(HELLO_TIMEOUT_S)
     assert isinstance(link.told()[0], r.ContactLost)

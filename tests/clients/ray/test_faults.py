@@ -25,7 +25,7 @@ from vram_arbiter.clients.results import committed
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.testing.timeline import Timeline
 
-pytestmark = [pytest.mark.nightly, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.heavy, pytest.mark.nightly, pytest.mark.timeout(600)]
 
 SEEDS = 40
 EPISODE_S = 0.1

@@ -16,7 +16,7 @@ from vram_arbiter.clients.calibration.gpu import Gpu, Reading, fake_gpu
 from vram_arbiter.clients.cli.demo_programs import Programs
 from vram_arbiter.clients.selftest import report, rows
 from vram_arbiter.clients.selftest.bed import Bed, Missed, Skipped, answered_within, need
-from vram_arbiter.clients.selftest.run import Result, judged
+from vram_arbiter.clients.selftest.run import Outcome, judged
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.errors import NoGpu, ProbeFailed
@@ -103,10 +103,10 @@ def test_a_driver_that_hangs_is_left_behind() -> None:
 
 
 RESULTS = [
-    Result("a", "c", 4.0, "ms", "≤ 5 ms", "s", "pass", "x|y"),
-    Result("b", "c", 6.0, "ms", "≤ 5 ms", "s", "miss", "slow"),
-    Result("c", "c", None, "ms", "≤ 5 ms", "s", "skipped", "why"),
-    Result("d", "c", None, "ms", "", "s", "failed", "NoGpu: \x1b[2Jnone"),
+    Outcome("a", "c", 4.0, "ms", "≤ 5 ms", "s", "pass", "x|y"),
+    Outcome("b", "c", 6.0, "ms", "≤ 5 ms", "s", "miss", "slow"),
+    Outcome("c", "c", None, "ms", "≤ 5 ms", "s", "skipped", "why"),
+    Outcome("d", "c", None, "ms", "", "s", "failed", "NoGpu: \x1b[2Jnone"),
 ]
 
 

@@ -6,12 +6,12 @@ import pytest
 
 from tests.runner.manual_clock import ManualClock
 from vram_arbiter.runner.benchmark.outcomes import Cell, SeedOutcome, unplayed
-from vram_arbiter.runner.benchmark.progress import Progress
+from vram_arbiter.runner.benchmark.progress import ProgressLine
 
 
 def test_rate_and_time_left_are_of_this_run(caplog: pytest.LogCaptureFixture) -> None:
     clock, cell = ManualClock(), Cell("so101", "random", "grab")
-    progress = Progress(5, clock.now_s)
+    progress = ProgressLine(5, clock.now_s)
     with caplog.at_level(logging.INFO):
         clock.advance(30)
         progress.tell(cell, SeedOutcome(7, True, 40))
@@ -28,7 +28,7 @@ def test_a_terminal_has_one_line(
     import sys
 
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    progress = Progress(2)
+    progress = ProgressLine(2)
     for seed in (0, 1):
         progress.tell(Cell("so101", "random", "grab"), unplayed(seed, "a\x1b[2Jb\n"))
     progress.end()
