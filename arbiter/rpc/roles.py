@@ -1,7 +1,7 @@
 """What each role may ask: its requests, and the refusal of all others.
 
 A request that is new on the wire is refused to observers, unless it is a question, and to guests.
-Must not know sessions; who has which role says `arbiter.rpc.peer`.
+Which peer has which role: `arbiter.rpc.peer`. Must not know sessions.
 """
 
 import os

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from random import Random
-from types import TracebackType
 from typing import Any, Final, Self
 
 from vram_arbiter.clients.ray import agent, placement
@@ -74,12 +73,7 @@ class Fleet:
         self.views(ANSWER_S if agent.running(boxes) else START_S)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._agents.clear()
 
     def boxes(self) -> dict[str, str]:

@@ -28,7 +28,7 @@ _HOST: Final = re.compile(rf"(?:(?P<user>{_NAME})@)?(?P<name>{_NAME})(?::(?P<por
 _PATH: Final = re.compile(r"[\w/.,@+-]+", re.ASCII)
 """Without the characters that ssh reads in a forwarding: a colon, %, $, \\, a blank."""
 _OPTIONS: Final[Mapping[str, object]] = {
-    "BatchMode": "yes",  # a question has nobody to answer it
+    "BatchMode": "yes",  # it has no terminal to ask on
     "StrictHostKeyChecking": "yes",
     "GlobalKnownHostsFile": "/dev/null",
     "UpdateHostKeys": "no",

@@ -135,7 +135,7 @@ class Keeper:
                 preexec_fn=dying_with_parent(),
             )
         except FileNotFoundError as error:
-            raise ConfigError("there is no ssh", hint="apt install openssh-client") from error
+            raise ConfigError("ssh is not installed", hint="apt install openssh-client") from error
         hearing = asyncio.create_task(self._hear(ssh))
         try:
             yield ssh

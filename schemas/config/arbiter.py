@@ -203,7 +203,7 @@ class WireConfig(_Section):
     Where `group` is set, operators are members of both. Null: no group may."""
     guests_group: Annotated[str, Field(min_length=1, max_length=64)] | None = None
     """Unix group whose members are guests, as robots behind ssh: they mark uses and hold no lease.
-    They are members of `group` too, which lets them connect. Null: nobody is a guest."""
+    They are members of `group` too, which lets them connect. Null: there are no guests."""
 
     @field_validator("endpoint")
     @classmethod

@@ -1,4 +1,4 @@
-"""Results of numbered work: the first commit of a seed wins, whoever else commits it."""
+"""Results of numbered work: the first commit of a seed wins."""
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path

@@ -31,13 +31,6 @@ SEEDS = 40
 EPISODE_S = 0.1
 
 
-@pytest.fixture(scope="module")
-def boxes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Boxes]:
-    with Boxes(tmp_path_factory.mktemp("b"), nodes=2) as boxes:
-        boxes.connect()
-        yield boxes
-
-
 @pytest.fixture
 def notes(tmp_path: Path) -> Path:
     made = tmp_path / "notes"

@@ -86,13 +86,6 @@ def test_an_address_without_a_cluster_is_refused_at_once(address: str) -> None:
 
 
 # -- with raylets
-@pytest.fixture(scope="module")
-def boxes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Boxes]:
-    with Boxes(tmp_path_factory.mktemp("b"), nodes=2) as boxes:
-        boxes.connect()
-        yield boxes
-
-
 @pytest.fixture
 def fleet(boxes: Boxes) -> Iterator[Fleet]:
     with Fleet() as fleet:

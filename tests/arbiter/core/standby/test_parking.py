@@ -306,7 +306,7 @@ def test_a_lost_journal_does_not_lose_it(standby: bool) -> None:
 
 
 def test_a_holder_that_parked_unasked_while_the_daemon_was_away_has_its_ram_counted() -> None:
-    """Nobody had asked it to leave, so no room in RAM was booked for it before the restart."""
+    """It had not been asked to leave, so no room in RAM was booked before the restart."""
     driver = driver_with()
     vlm, lease = held(driver, "vlm", 5, park_bytes=5 * GIB, residue_bytes=RESIDUE)
     token = vlm.token(lease)
