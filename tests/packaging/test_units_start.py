@@ -396,6 +396,11 @@ def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
         lambda: True if "runner.sock" in machine.run("ls", "/run/vram-arbiter").split() else None,
         lambda: machine.log(f"{runner}.service"),
     )
+    guest = ("setpriv", "--reuid=games", "--regid=vram-guests", "--groups=vram-arbiter")
+    machine.run(*guest, *load)
+    state = ("vram-runner", "state", "--endpoint", "ipc:///run/vram-arbiter/runner.sock")
+    said = machine.run("sh", "-c", '! "$@" 2>&1', "sh", *guest, *state)
+    assert "a guest may not use runner" in said
     machine.run("vram-runner", "estop", "--reason", "a test", user="vram-robot")
     machine.start(reasoner)
     answer_of(
