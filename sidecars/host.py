@@ -74,7 +74,10 @@ class SidecarHost:
                 settings = replace(settings, gpu=settings.gpu or leased_gpu(settings.device))
             server = await stack.enter_async_context(
                 RouterServer(
-                    settings.endpoint, unread_reply(self._adapter.ops), work_share=WORK_SHARE
+                    settings.endpoint,
+                    unread_reply(self._adapter.ops),
+                    work_share=WORK_SHARE,
+                    closed_to=None,  # a robot's tunnel leads here
                 )
             )
             if settings.port is not None:

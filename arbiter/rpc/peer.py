@@ -1,5 +1,5 @@
-"""What a peer may be: visible, and perhaps an operator or a guest. Which process it is says the
-kernel (`schemas.runtime.peercred`).
+"""What a peer may be: visible, and perhaps an operator. Which process it is, and whether it is a
+guest, says `schemas.runtime.peercred`.
 
 Must not know sessions or requests.
 """
@@ -29,14 +29,6 @@ def is_operator(peer: Peer, operators_gid: int | None) -> bool:
     if peer.uid in (0, os.getuid()):
         return True
     return operators_gid is not None and peer.belongs_to(operators_gid)
-
-
-def is_guest(peer: Peer, guests_gid: int | None) -> bool:
-    """A member of the guests' group, whatever else it belongs to; never root or the daemon's
-    user."""
-    if guests_gid is None or peer.uid in (0, os.getuid()):
-        return False
-    return peer.belongs_to(guests_gid)
 
 
 def check_cgroup(peer: Peer, cgroup: str, root: Path | None, operators_gid: int | None) -> None:

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Protocol
 
 from vram_arbiter.arbiter.core import events as ev
-from vram_arbiter.arbiter.rpc.peer import check_visible, how_to_operate, is_guest, is_operator
+from vram_arbiter.arbiter.rpc.peer import check_visible, how_to_operate, is_operator
 from vram_arbiter.arbiter.rpc.roles import Role
 from vram_arbiter.schemas.errors import LimitExceeded, NotPermitted
 from vram_arbiter.schemas.ids import ClientId, ProcessKey
-from vram_arbiter.schemas.runtime.peercred import Peer
+from vram_arbiter.schemas.runtime.peercred import Peer, is_guest
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.explained import WhyReply
 from vram_arbiter.schemas.wire.replies import StatusReply

@@ -56,8 +56,8 @@ def run(args: argparse.Namespace) -> int:
         authorize.install(guest)
         left = [f"wrote {guest.file}"]
     else:
-        write = f"install -D -m 644 /dev/stdin {guest.file} <<< {shlex.quote(guest.line)}"
-        commands = (*map(shlex.join, guest.commands()), write)
+        made, joined, written = map(shlex.join, guest.commands())
+        commands = (made, joined, f"{written} <<< {shlex.quote(guest.line)}")
         left = ["as root, or with --install:", *(f"  {one}" for one in commands)]
     told = [guest.line, "", f"{guest.user} may, as a guest of this server's arbiter, open"]
     told += [f"  {one}" for one in guest.reached]

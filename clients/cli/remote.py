@@ -16,7 +16,7 @@ from vram_arbiter.clients.cli.replies import NO, OK, answer
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.net.link import is_listening
 from vram_arbiter.clients.remote import ssh
-from vram_arbiter.clients.remote.tunnel import Keeper
+from vram_arbiter.clients.remote.tunnel import keep
 from vram_arbiter.schemas.errors import AlreadyRunning, VramError
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.endpoints import IPC, SYSTEM_RUNTIME
@@ -40,11 +40,7 @@ STATUS_S: Final = 3.0  # to be answered through a tunnel
 
 def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     commands = parser.add_subparsers(metavar="ACTION", required=True)
-    for name, add in (
-        ("authorize", authorize.add),
-        ("up", _add_up),
-        ("status", _add_status),
-    ):
+    for name, add in (("authorize", authorize.add), ("up", _add_up), ("status", _add_status)):
         add(commands.add_parser(name, help=ACTIONS[name], description=ACTIONS[name]))
 
 
@@ -77,26 +73,19 @@ def _door(written: str) -> tuple[int, int]:
 def _up(args: argparse.Namespace) -> int:
     """Keep the tunnel until SIGTERM or SIGINT. Raises RemoteRefused, ConfigError,
     AlreadyRunning."""
+    folder = ssh.folder_of(args.host, os.environ, os.getuid())
     settings = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+    hosts, names = settings / "vram-arbiter/known_hosts", (ssh.ARBITER, *args.sidecars)
     tunnel = ssh.Tunnel(
-        args.host,
-        ssh.folder_of(args.host, os.environ, os.getuid()),
-        settings / "vram-arbiter/known_hosts",
-        tuple(args.sidecars),
-        tuple(args.door),
-        args.server_runtime,
-        args.identity,
+        args.host, folder, hosts, names, tuple(args.door), args.server_runtime, args.identity
     )
     tunnel.command()  # what is wrong with it, before a folder is made
-    private_folder(tunnel.folder.parent.parent, shared=True)
-    private_folder(tunnel.folder.parent)
-    private_folder(tunnel.folder)
-    lock = _lock(tunnel.folder)
-    lock.acquire()
-    try:
-        return asyncio.run(_keep(tunnel))
-    finally:
-        lock.release()
+    private_folder(folder.parent.parent, shared=True)
+    private_folder(folder.parent)
+    private_folder(folder)
+    lock = _lock(folder)
+    lock.acquire()  # until the program ends
+    return asyncio.run(_keep(tunnel))
 
 
 def _lock(folder: Path) -> LockFile:
@@ -110,7 +99,7 @@ async def _keep(tunnel: ssh.Tunnel) -> int:
         print(line, file=sys.stderr, flush=True)
         (notifier.ready if up else notifier.status)(line)
 
-    keeping = asyncio.ensure_future(Keeper(tunnel, tell).keep())
+    keeping = asyncio.ensure_future(keep(tunnel, tell))
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, keeping.cancel)
     with contextlib.suppress(asyncio.CancelledError):
@@ -127,14 +116,12 @@ def _add_status(parser: argparse.ArgumentParser) -> None:
 def _status(args: argparse.Namespace) -> int:
     """Return 0 if every tunnel is up, 1 if one is not or there is none."""
     code, told = answer(_tunnels, as_json=args.as_json, lines=_lines)
-    up = [one["state"] == "up" for one in told["tunnels"]]
-    return code if up and all(up) else NO
+    return code if {one["state"] for one in told["tunnels"]} == {"up"} else NO
 
 
 def _tunnels() -> Message:
     place = ssh.tunnels_folder(os.environ, os.getuid())
-    folders = sorted(place.iterdir()) if place.is_dir() else []
-    return {"ok": True, "tunnels": [_tunnel(folder) for folder in folders]}
+    return {"ok": True, "tunnels": [_tunnel(folder) for folder in sorted(place.glob("*"))]}
 
 
 def _tunnel(folder: Path) -> Message:
@@ -166,11 +153,8 @@ def _lines(told: Message) -> list[str]:
     if not told["tunnels"]:
         return ["no tunnel; `vramctl remote up HOST` makes one"]
     columns = {"host": "HOST", "state": "STATE", "round_trip_ms": "MS", "role": "ROLE"}
-    rows = [
-        [
-            *(str(one.get(key, "")) for key in columns),
-            one.get("problem", ", ".join(one["sidecars"])),
-        ]
-        for one in told["tunnels"]
-    ]
+    rows = []
+    for one in told["tunnels"]:
+        shown = one.get("problem") or ", ".join(one["sidecars"])
+        rows.append([*(str(one.get(key, "")) for key in columns), shown])
     return text.table([*columns.values(), "SIDECARS"], rows)

@@ -9,12 +9,13 @@ drive the robot. It must not know what a message means.
 
 import asyncio
 import contextlib
+import grp
 import logging
 import os
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import Final, Self
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -23,6 +24,7 @@ from vram_arbiter.schemas.errors import (
     BadRequest,
     LimitExceeded,
     MessageTooLarge,
+    NotPermitted,
     UnknownOp,
     VramError,
 )
@@ -31,10 +33,14 @@ from vram_arbiter.schemas.runtime.connection import Bounds, Connection
 from vram_arbiter.schemas.runtime.endpoints import socket_path
 from vram_arbiter.schemas.runtime.folders import LockFile, socket_folder
 from vram_arbiter.schemas.runtime.msgpack_codec import UnpackLimits, leading_id, pack, unpack_map
+from vram_arbiter.schemas.runtime.peercred import is_guest
 from vram_arbiter.schemas.runtime.router import Router
 from vram_arbiter.schemas.runtime.zmtp import Oversize
 
 log = logging.getLogger(__name__)
+
+GUESTS: Final = "vram-guests"
+"""Unix group of robots behind ssh, as configs/ssh/vram-guests.conf and sysusers.d name it."""
 
 REASON_MAX_CHARS = 500
 ENVELOPE_MAX_BYTES = 64 * 1024
@@ -85,6 +91,7 @@ class _Client:
 
     connection: Connection
     peer: Peer
+    is_guest: bool
     budget: float = RATE_PER_CLIENT_PER_S  # messages it may send at once
     counted_at: float = 0.0
 
@@ -122,13 +129,22 @@ def _lock_of(path: Path) -> LockFile:
     return LockFile(Path(f"{path}.lock"), f"ipc://{path}", "a server")
 
 
+def _number_of(group: str | None) -> int | None:
+    """Return the number of a Unix group; None where there is none."""
+    try:
+        return None if group is None else grp.getgrnam(group).gr_gid
+    except KeyError:
+        return None
+
+
 class RouterServer:
     """`async with RouterServer(endpoint, on_error) as server: await server.serve(handler)`.
 
     A handler runs in a task of its own, so that a slow one delays no other request; its work up to
     the first wait is done at once.
     Args: `message_max_bytes` bounds one request; beside binary values, as pictures are, it holds at
-    most 1 MiB. `work_share` as in `schemas.runtime.connection.Bounds`.
+    most 1 MiB. `work_share` as in `schemas.runtime.connection.Bounds`. `closed_to`: a Unix group whose
+    members are answered NotPermitted, None: there is none.
     Raises ConfigError for an endpoint that cannot be bound, AlreadyRunning when a living server has
     it.
     """
@@ -140,10 +156,12 @@ class RouterServer:
         *,
         message_max_bytes: int = IMAGES_MAX_BYTES,
         work_share: float = 1.0,
+        closed_to: str | None = GUESTS,
     ) -> None:
         self.endpoint = endpoint
         self._path = path_of(endpoint)
         self._on_error = on_error
+        self._closed_to = _number_of(closed_to)
         self._unpack = UnpackLimits(
             message_max_bytes, values_max=VALUES_MAX, keys_max=KEYS_MAX, items_max=ITEMS_MAX
         )
@@ -211,7 +229,8 @@ class RouterServer:
     # -- for the router
     def connected(self, connection: Connection) -> None:
         peer = Peer(connection.serial, connection.peer.process.pid, connection.peer.uid)
-        self._clients[connection.serial] = _Client(connection, peer)
+        guest = is_guest(connection.peer, self._closed_to)
+        self._clients[connection.serial] = _Client(connection, peer, guest)
 
     def disconnected(self, connection: Connection, reason: str) -> None:
         del self._clients[connection.serial]
@@ -220,6 +239,11 @@ class RouterServer:
         client, loop = self._clients[connection.serial], asyncio.get_running_loop()
         within_rate = client.within_rate(loop.time())
         try:
+            if client.is_guest:
+                raise NotPermitted(
+                    f"a guest may not use {self._path.stem}",
+                    hint=f"ask on {os.uname().nodename}, as a user outside the guests' group",
+                )
             message, size = self._decoded(payload)
             waiting = self._waiting_of(client.peer.uid, size)
         except VramError as error:

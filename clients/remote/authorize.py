@@ -56,12 +56,15 @@ class Guest:
         permits = ",".join(f'permitopen="{one}"' for one in opened)
         return f"restrict,port-forwarding,{permits} {self.key} {self.name}"
 
-    def commands(self) -> tuple[list[str], list[str]]:
-        """Return the commands that make the user, if there is none, and put it into the groups."""
+    def commands(self) -> tuple[list[str], ...]:
+        """Return the commands that let it in, for root: make the user, if there is none, put it
+        into the groups, and write the line, which is read from standard input."""
         # the password is none, yet not locked: without PAM sshd refuses a locked account its key
         account = ["--no-create-home", "--home-dir", "/nonexistent", "--password", "*"]
         made = ["useradd", "--system", *account, "--shell", "/usr/sbin/nologin", self.user]
-        return made, ["usermod", "--append", "--groups", ",".join(GROUPS), self.user]
+        joined = ["usermod", "--append", "--groups", ",".join(GROUPS), self.user]
+        # sshd reads the file as the user
+        return made, joined, ["install", "-D", "-m", "644", "/dev/stdin", str(self.file)]
 
 
 def read_key(path: Path) -> str:
@@ -85,18 +88,13 @@ def read_key(path: Path) -> str:
 
 
 def install(guest: Guest) -> None:
-    """Make the user and write its key, as root; a key that it had is replaced. Raises
-    InstallFailed."""
+    """Run the commands, as root; a key that the user had is replaced. Raises InstallFailed."""
     for command in guest.commands():
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            command, input=f"{guest.line}\n", capture_output=True, text=True, check=False
+        )
         if done.returncode not in (0, USER_EXISTS):
             raise InstallFailed(
                 f"`{shlex.join(command)}` failed with {done.returncode}: {done.stderr.strip()}",
                 hint="run it as root, after `vramctl install`, which makes the groups",
             )
-    try:
-        KEYS.mkdir(mode=0o755, parents=True, exist_ok=True)
-        guest.file.write_text(f"{guest.line}\n")
-        guest.file.chmod(0o644)  # sshd reads it as the user
-    except OSError as error:
-        raise InstallFailed(f"{guest.file}: {error.strerror}", hint="run it as root") from error

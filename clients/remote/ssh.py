@@ -16,15 +16,15 @@ from typing import Final
 from vram_arbiter.clients.net.link import is_listening
 from vram_arbiter.clients.remote import dial
 from vram_arbiter.schemas.errors import ConfigError, SidecarUnavailable
-from vram_arbiter.schemas.runtime.endpoints import IPC, SYSTEM_RUNTIME, check_endpoint, runtime_dir
+from vram_arbiter.schemas.runtime.endpoints import IPC, SYSTEM_RUNTIME, runtime_dir, socket_path
 
 ARBITER: Final = "arbiter"
 """The name of its socket, beside those of the sidecars."""
 FORWARDED: Final = "forwarded"
-"""What ssh says on its output when it is connected and listens (LocalCommand)."""
+"""What ssh says when it is connected and listens (LocalCommand)."""
 SCHEME: Final = "ssh://"
 _NAME: Final = r"[A-Za-z0-9_][A-Za-z0-9_.-]*"
-_HOST: Final = re.compile(rf"(?:(?P<user>{_NAME})@)?(?P<name>{_NAME})(?::(?P<port>[0-9]{{1,5}}))?")
+_HOST: Final = re.compile(rf"(?:{_NAME}@)?{_NAME}(?::([0-9]{{1,5}}))?")
 _PATH: Final = re.compile(r"[\w/.,@+-]+", re.ASCII)
 """Without the characters that ssh reads in a forwarding: a colon, %, $, \\, a blank."""
 _OPTIONS: Final[Mapping[str, object]] = {
@@ -38,35 +38,26 @@ _OPTIONS: Final[Mapping[str, object]] = {
     "ServerAliveInterval": 1,
     "ServerAliveCountMax": 3,
     "ConnectTimeout": 10,
-    "ControlMaster": "no",  # another ssh's connection would be neither fast nor ours to end
-    "ControlPath": "none",
-    "ForwardAgent": "no",
-    "ForwardX11": "no",
+    "ControlPath": "none",  # another ssh's connection would be neither fast nor ours to end
     "Compression": "no",
-    "RequestTTY": "no",
     "LogLevel": "INFO",  # names the channels that the server refuses
     "PermitLocalCommand": "yes",
-    "LocalCommand": f"echo {FORWARDED}",
+    "LocalCommand": f"echo {FORWARDED} >&2",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Tunnel:
-    """What is forwarded from a server: its arbiter, sidecars by name, and loopback ports of
-    doors, here and there."""
+    """What is forwarded from a server: sockets by name, of its arbiter and of sidecars, and
+    loopback ports of doors, here and there."""
 
     host: str
     folder: Path
     known_hosts: Path
-    sidecars: tuple[str, ...] = ()
+    names: tuple[str, ...] = (ARBITER,)
     doors: tuple[tuple[int, int], ...] = ()
     server_runtime: str = SYSTEM_RUNTIME
     identity: Path | None = None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the forwarded sockets."""
-        return (ARBITER, *self.sidecars)
 
     def socket(self, name: str) -> Path:
         """Return the path of a forwarded socket on the robot."""
@@ -75,33 +66,30 @@ class Tunnel:
     def command(self) -> list[str]:
         """Return ssh's command line. Raises ConfigError: a path that it would read otherwise, or
         one that is too long for a socket."""
-        host = parts_of(self.host)
-        words = ["ssh", "-N"]
-        for option, value in {**_OPTIONS, "UserKnownHostsFile": _plain(self.known_hosts)}.items():
-            words += ["-o", f"{option}={value}"]
+        check_host(self.host)
         fast = shlex.join([sys.executable, "-IS", dial.__file__]).replace("%", "%%")
-        words += ["-o", f"ProxyCommand={fast} %h %p"]
+        own = {"ProxyCommand": f"{fast} %h %p", "UserKnownHostsFile": _plain(self.known_hosts)}
+        words = ["ssh", "-Nax"]  # no command, no agent, no X11
+        for option, value in {**_OPTIONS, **own}.items():
+            words += ["-o", f"{option}={value}"]
         for name in self.names:
-            local = _socket(self.socket(name))
-            words += ["-L", f"{local}:{_socket(Path(self.server_runtime, f'{name}.sock'))}"]
+            ends = (self.socket(name), f"{self.server_runtime}/{name}.sock")
+            words += ["-L", ":".join(_plain(socket_path(f"{IPC}{end}")) for end in ends)]
         for here, there in self.doors:
             words += ["-L", f"127.0.0.1:{here}:127.0.0.1:{there}"]
         if self.identity is not None:
             words += ["-o", "IdentitiesOnly=yes", "-i", str(self.identity)]
-        for flag, part in (("-l", "user"), ("-p", "port")):
-            words += [flag, host[part]] if host[part] else []
-        return [*words, "--", host["name"]]
+        return [*words, "--", f"{SCHEME}{self.host}"]
 
 
-def parts_of(host: str) -> Mapping[str, str]:
-    """Return `user`, `name` and `port` of a server, "" where ssh's configuration says it. Raises
-    ConfigError."""
-    if (found := _HOST.fullmatch(host)) is None:
+def check_host(host: str) -> None:
+    """Raises ConfigError for what does not name a server."""
+    found = _HOST.fullmatch(host)
+    if found is None or not 0 < int(found[1] or 22) < 65536:
         raise ConfigError(
             f"expected a server as [USER@]NAME[:PORT], got {host!r}",
             hint="for anything else write a Host in ~/.ssh/config and name that",
         )
-    return found.groupdict("")
 
 
 def tunnels_folder(environ: Mapping[str, str], uid: int) -> Path:
@@ -111,7 +99,7 @@ def tunnels_folder(environ: Mapping[str, str], uid: int) -> Path:
 
 def folder_of(host: str, environ: Mapping[str, str], uid: int) -> Path:
     """Return the folder of a server's forwarded sockets. Raises ConfigError."""
-    parts_of(host)
+    check_host(host)
     return tunnels_folder(environ, uid) / host.replace(":", ",")
 
 
@@ -139,16 +127,7 @@ def forwarded(address: str, environ: Mapping[str, str], uid: int) -> tuple[str, 
     return found[0], found[1]
 
 
-def _plain(path: Path) -> str:
+def _plain(path: Path | str) -> str:
     if not _PATH.fullmatch(str(path)):
         raise ConfigError(f"ssh cannot be given the path {str(path)!r}", hint="choose a plain one")
     return str(path)
-
-
-def _socket(path: Path) -> str:
-    """Raises ConfigError: no path of a socket, or none that ssh takes."""
-    try:
-        check_endpoint(f"{IPC}{path}")
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
-    return _plain(path)

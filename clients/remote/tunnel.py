@@ -1,17 +1,17 @@
 """Keep a tunnel: start ssh, see that a server greets behind every socket, start again after a loss.
 
 ssh tells by a line that it listens, and by its end that the network is gone. A refusal (a host key,
-the robot's key, a forwarding) would be the next attempt's too: it ends the keeper. Must not know
+the robot's key, a forwarding) would be the next attempt's too: it ends the keeping. Must not know
 what is said on the sockets.
 """
 
 import asyncio
+import contextlib
 import os
 import re
 from asyncio.subprocess import DEVNULL, PIPE, Process
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Final, Never
 
@@ -27,9 +27,9 @@ GREETING_S: Final = 5.0
 """How long a server may take to greet: it does so at once, before it is asked anything."""
 CONNECT_S: Final = 30.0
 """For ssh to listen; it looks for signs of life only from then on."""
-LAST_WORDS_S: Final = 1.0
 WORDS_MAX: Final = 20  # lines of ssh that are looked at
-
+type Tell = Callable[[str, bool], None]
+"""Gets lines for people, and whether the tunnel is up."""
 
 REFUSALS: Final[Mapping[str, tuple[str, str]]] = {
     "host_key": (
@@ -69,103 +69,92 @@ def refusal(tunnel: Tunnel, words: Sequence[str], *, reached: bool) -> RemoteRef
     return None
 
 
-class Keeper:
-    """`keep` runs until it is canceled, or the server refuses. `tell` gets lines for people, and
-    whether the tunnel is up."""
-
-    def __init__(self, tunnel: Tunnel, tell: Callable[[str, bool], None]) -> None:
-        self._tunnel = tunnel
-        self._tell = tell
-        self._words: deque[str] = deque(maxlen=WORDS_MAX)
-        self._is_up = False
-
-    async def keep(self) -> Never:
-        """Raises RemoteRefused, ConfigError."""
-        pause_s, reached = RETRY_S, False
-        while True:
-            self._words.clear()
-            if await self._one():
-                pause_s, reached = RETRY_S, True
-            elif error := refusal(self._tunnel, self._words, reached=reached):
-                raise error
-            why = self._words[-1] if self._words else "ssh ended"
-            self._tell(f"no tunnel to {self._tunnel.host}: {why}; again in {pause_s:g} s", False)
-            await asyncio.sleep(pause_s)
-            pause_s = min(2 * pause_s, RETRY_MAX_S)
-
-    async def _one(self) -> bool:
-        """Run one ssh to its end, with its last lines in `_words`. Return whether the tunnel was
-        up."""
-        async with self._ssh() as ssh:
-            if problem := await self._unready(ssh):
-                self._words.append(problem)
-                return False
-            self._is_up = True
-            self._tell(
-                f"tunnel to {self._tunnel.host} is up: {', '.join(self._tunnel.names)}", True
-            )
-            await ssh.wait()
-            self._is_up = False
-            return True
-
-    async def _unready(self, ssh: Process) -> str:
-        """Return why the tunnel is not up, beside what ssh says of it; "": it is."""
-        assert ssh.stdout is not None
-        try:
-            async with asyncio.timeout(CONNECT_S):
-                said = await ssh.stdout.readline()
-        except TimeoutError:
-            return f"no connection within {CONNECT_S:g} s"
-        if said.decode().strip() != FORWARDED:
-            return "ssh ended"
-        problems = [await _unserved(self._tunnel.socket(name)) for name in self._tunnel.names]
-        return "; ".join(filter(None, problems))
-
-    @asynccontextmanager
-    async def _ssh(self) -> AsyncIterator[Process]:
-        """A running ssh; at the end it has ended, and its sockets are removed."""
-        try:
-            ssh = await asyncio.create_subprocess_exec(
-                *self._tunnel.command(),
-                stdin=DEVNULL,
-                stdout=PIPE,
-                stderr=PIPE,
-                # ssh starts its ProxyCommand by it; a service's user has one that starts nothing
-                env={**os.environ, "SHELL": "/bin/sh"},
-                preexec_fn=dying_with_parent(),
-            )
-        except FileNotFoundError as error:
-            raise ConfigError("ssh is not installed", hint="apt install openssh-client") from error
-        hearing = asyncio.create_task(self._hear(ssh))
-        try:
-            yield ssh
-        finally:
-            if ssh.returncode is None:
-                ssh.terminate()
-            await ssh.wait()
-            await asyncio.wait([hearing], timeout=LAST_WORDS_S)
-            hearing.cancel()
-            for name in self._tunnel.names:
-                self._tunnel.socket(name).unlink(missing_ok=True)
-
-    async def _hear(self, ssh: Process) -> None:
-        assert ssh.stderr is not None
-        async for line in ssh.stderr:
-            if text := printable(line.decode(errors="replace").strip()):
-                self._words.append(text)
-                if self._is_up:  # such as a channel that the server refuses
-                    self._tell(f"{self._tunnel.host}: {text}", True)
+async def keep(tunnel: Tunnel, tell: Tell) -> Never:
+    """Keep a tunnel until this is canceled. Raises RemoteRefused, ConfigError."""
+    pause_s, reached = RETRY_S, False
+    while True:
+        words: deque[str] = deque(maxlen=WORDS_MAX)
+        if await _once(tunnel, tell, words):
+            pause_s, reached = RETRY_S, True
+        elif error := refusal(tunnel, words, reached=reached):
+            raise error
+        why = words[-1] if words else "ssh ended"
+        tell(f"no tunnel to {tunnel.host}: {why}; again in {pause_s:g} s", False)
+        await asyncio.sleep(pause_s)
+        pause_s = min(2 * pause_s, RETRY_MAX_S)
 
 
-async def _unserved(path: Path) -> str:
-    """Return why no server greets behind a forwarded socket; "": one does."""
+async def _once(tunnel: Tunnel, tell: Tell, words: deque[str]) -> bool:
+    """Run one ssh to its end, and add its last lines to `words`, at the end why the tunnel did not
+    come up. Return whether it was up."""
+    up, problem = False, ""
+    try:
+        async with _started(tunnel) as ssh, asyncio.timeout(CONNECT_S) as connecting:
+            async for line in _lines(ssh):
+                if line == FORWARDED:
+                    connecting.reschedule(None)
+                    if problem := await _unserved(tunnel):
+                        ssh.terminate()
+                    else:
+                        up = True
+                        tell(f"tunnel to {tunnel.host} is up: {', '.join(tunnel.names)}", up)
+                else:
+                    words.append(line)
+                    if up:  # such as a channel that the server refuses
+                        tell(f"{tunnel.host}: {line}", up)
+    except TimeoutError:
+        problem = f"no connection within {CONNECT_S:g} s"
+    if problem:
+        words.append(problem)
+    return up
+
+
+@contextlib.asynccontextmanager
+async def _started(tunnel: Tunnel) -> AsyncIterator[Process]:
+    """A running ssh; at the end it has ended, and its sockets are removed. Raises ConfigError."""
+    try:
+        ssh = await asyncio.create_subprocess_exec(
+            *tunnel.command(),
+            stdin=DEVNULL,
+            stdout=DEVNULL,
+            stderr=PIPE,
+            # ssh starts its ProxyCommand by it; a service's user has one that starts nothing
+            env={**os.environ, "SHELL": "/bin/sh"},
+            preexec_fn=dying_with_parent(),
+        )
+    except FileNotFoundError as error:
+        raise ConfigError("ssh is not installed", hint="apt install openssh-client") from error
+    try:
+        yield ssh
+    finally:
+        if ssh.returncode is None:
+            ssh.terminate()
+        await ssh.wait()
+        for name in tunnel.names:
+            tunnel.socket(name).unlink(missing_ok=True)
+
+
+async def _lines(ssh: Process) -> AsyncIterator[str]:
+    """Yield what ssh says, and dial, until both have ended."""
+    assert ssh.stderr is not None
+    async for line in ssh.stderr:
+        if text := printable(line.decode(errors="replace").strip()):
+            yield text
+
+
+async def _unserved(tunnel: Tunnel) -> str:
+    """Return behind which of the forwarded sockets no server greets, and why; "": one does behind
+    each."""
+    found = [await _ungreeted(tunnel.socket(name)) for name in tunnel.names]
+    return "; ".join(filter(None, found))
+
+
+async def _ungreeted(path: Path) -> str:
     try:
         async with asyncio.timeout(GREETING_S):
             reader, writer = await asyncio.open_unix_connection(path)
-            try:
+            with contextlib.closing(writer):
                 greeted = await reader.read(1)
-            finally:
-                writer.close()
     except TimeoutError:
         return f"{path.stem} is silent"
     except OSError as error:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.remote.ssh import forwarded
@@ -21,14 +21,13 @@ type Remote = Mapping[str, tuple[str, str]]
 
 
 def remote_sidecars(
-    file: DeploymentFile, manifests: Iterable[RSkillManifest], environ: Mapping[str, str]
+    file: DeploymentFile, installed: Collection[RSkillManifest], environ: Mapping[str, str]
 ) -> Remote:
     """Return the file's `sidecars`, through the tunnels that are up.
 
     Raises ConfigError with every entry that names no server or no installed skill,
     SidecarUnavailable where a tunnel is missing.
     """
-    installed = list(manifests)
     found: dict[str, tuple[str, str]] = {}
     problems: list[tuple[str, str]] = []
     for key, address in file.robot.sidecars.items():

@@ -56,6 +56,14 @@ class Peer:
         return group in os.getgrouplist(account.pw_name, account.pw_gid)
 
 
+def is_guest(peer: Peer, guests_gid: int | None) -> bool:
+    """Return whether a peer is a member of the guests' group, whatever else it belongs to; never
+    root or this process's user."""
+    if guests_gid is None or peer.uid in (0, os.getuid()):
+        return False
+    return peer.belongs_to(guests_gid)
+
+
 def credentials(sock: socket.socket) -> tuple[int, int, int]:
     """Return pid, uid and gid of the peer of a connected unix socket."""
     pid, uid, gid = _UCRED.unpack(

@@ -21,7 +21,7 @@ from tests.support.guests import USER
 from tests.support.prepared import start
 from tests.support.sshd import Sshd
 from tests.support.waiting import PATIENCE_S, until
-from vram_arbiter.clients.remote.ssh import ARBITER, Tunnel
+from vram_arbiter.clients.remote.ssh import ARBITER, FORWARDED, Tunnel
 
 PICTURES_BYTES = 450_000
 """Two cameras of a policy's observation."""
@@ -81,12 +81,11 @@ def forwarded(sshd: Sshd, socket: Path, folder: Path, way: str) -> Iterator[Path
     if way != "dial":
         (dial,) = (at for at, word in enumerate(command) if word.startswith("ProxyCommand="))
         del command[dial - 1 : dial + 1]
-    ssh = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    ssh = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
-        assert ssh.stdout is not None
-        if not ssh.stdout.readline():
-            _, said = ssh.communicate()
-            raise AssertionError(said.decode())
+        assert ssh.stderr is not None
+        said = ssh.stderr.readline()
+        assert said.strip() == FORWARDED, said + ssh.communicate()[1]
         yield tunnel.socket(ARBITER)
     finally:
         ssh.terminate()

@@ -74,8 +74,8 @@ class Machine:
         self._init_pid = 0
         self._process: subprocess.Popen[bytes] | None = None
         self._answering: subprocess.Popen[str] | None = None
-        self._cgroup = _own_cgroup() / f"vram-machine-{os.getpid()}"
-        self._scratch = Path(tempfile.mkdtemp(prefix="vm"))
+        self._scratch = Path(tempfile.mkdtemp(prefix="vram-machine-"))
+        self._cgroup = _own_cgroup() / self._scratch.name  # a process may have several machines
         self.prefix = self._scratch / "prefix"
         """The machine's /opt/vram-arbiter, which is read-only inside."""
         try:
@@ -202,14 +202,17 @@ class Machine:
             os.close(self._init)
         if self._answering is not None:  # ended with the machine
             self._answering.communicate()
-        self._remove_cgroup(time.monotonic() + PATIENCE_S)
+        if self._cgroup.exists():
+            self._remove_cgroup()
         shutil.rmtree(self._scratch)
 
-    def _remove_cgroup(self, deadline: float) -> None:
-        """The kernel frees a cgroup a moment after its last process ended."""
-        while self._cgroup.exists():
-            assert time.monotonic() < deadline, f"{self._cgroup} is still in use"
-            for folder, _, _ in os.walk(self._cgroup, topdown=False):
-                with contextlib.suppress(OSError):
-                    os.rmdir(folder)
-            time.sleep(0.01)
+    def _remove_cgroup(self) -> None:
+        """The kernel says when the last process has left: that may be after it was waited for."""
+        with (self._cgroup / "cgroup.events").open() as events:
+            changed = select.poll()
+            changed.register(events, select.POLLPRI)
+            while "populated 1" in events.read():
+                assert changed.poll(1e3 * PATIENCE_S), f"{self._cgroup} is still in use"
+                events.seek(0)
+        for folder, _, _ in os.walk(self._cgroup, topdown=False):
+            os.rmdir(folder)

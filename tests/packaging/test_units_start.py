@@ -7,6 +7,7 @@ that. The arbiter's unit is tried in every run of the tests, the others at night
 """
 
 import json
+import os
 import re
 import shutil
 import signal
@@ -264,36 +265,141 @@ def test_a_mistake_in_the_configuration_is_not_tried_again(machine: Machine) -> 
     machine.start(ARBITER)
 
 
-@pytest.mark.nightly
-def test_the_unit_of_a_user_starts_in_the_manager_of_a_user(machine: Machine) -> None:
-    """Such a manager has no privileges: a setting that drops capabilities keeps a unit from
-    starting there."""
-    home, runtime = "/tmp/home", "/run/user/robot"
+HOME, RUNTIME = "/tmp/home", "/run/user/robot"
+
+
+@contextmanager
+def manager_of_a_user(machine: Machine) -> Iterator[Callable[..., str]]:
+    """Start `systemd --user` of vram-robot, with the units installed for that user. Yields what
+    `Machine.run` does as the user."""
     own = ["install", "-d", "-o", "vram-robot", "-m", "700"]
-    machine.run(*own, home, runtime, f"{home}/.config", f"{home}/.config/vram-arbiter")
-    machine.write(f"{home}/.config/vram-arbiter/arbiter.env", 'ARBITER_OPTIONS="--gpu fake:8GiB"\n')
+    machine.run(*own, HOME, RUNTIME, f"{HOME}/.config", f"{HOME}/.config/vram-arbiter")
+    machine.write(f"{HOME}/.config/vram-arbiter/arbiter.env", 'ARBITER_OPTIONS="--gpu fake:8GiB"\n')
     machine.write(
         f"{SYSTEM}/manager.service",
         "[Service]\nType=notify\nUser=vram-robot\nDelegate=yes\nKillSignal=SIGKILL\n"
         "ExecStart=/lib/systemd/systemd --user\n"
         "StandardError=append:/run/logs/manager.log\n"
-        f"Environment=HOME={home} XDG_RUNTIME_DIR={runtime} "
-        f"SYSTEMD_UNIT_PATH={home}/.config/systemd/user:/run/targets\n",
+        f"Environment=HOME={HOME} XDG_RUNTIME_DIR={RUNTIME} "
+        f"SYSTEMD_UNIT_PATH={HOME}/.config/systemd/user:/run/targets\n",
     )
-    machine.run("ln", "-s", "multi-user.target", "/run/targets/default.target")
+    machine.run("ln", "-sf", "multi-user.target", "/run/targets/default.target")
     machine.run("systemctl", "daemon-reload")
     machine.start("manager.service")
-    as_user = ["env", f"HOME={home}", f"XDG_RUNTIME_DIR={runtime}", "vramctl"]
-    machine.run(*as_user, "install", "--yes", user="vram-robot", code=2)  # the machine's: for root
-    machine.run(*as_user, "install", "--user-units", "--yes", user="vram-robot")
-    endpoint = f"ipc://{runtime}/vram-arbiter/arbiter.sock"
-    status = ("vramctl", "status", "--json", "--endpoint", endpoint)
-    assert json.loads(machine.run(*status, user="vram-robot"))["phase"] == "serving"
-    machine.run(*as_user, "uninstall", "--user-units", "--purge", "--yes", user="vram-robot")
-    left = machine.run("find", home, runtime, "!", "-type", "d").split()
+
+    def as_user(*command: str, code: int = 0) -> str:
+        environ = ("env", f"HOME={HOME}", f"XDG_RUNTIME_DIR={RUNTIME}")
+        return machine.run(*environ, *command, user="vram-robot", code=code)
+
+    as_user("vramctl", "install", "--user-units", "--yes")
+    yield as_user
+    as_user("vramctl", "uninstall", "--user-units", "--purge", "--yes")
+    left = machine.run("find", HOME, RUNTIME, "!", "-type", "d").split()
     assert not [path for path in left if "vram" in path]
     machine.run("systemctl", "stop", "manager.service")
     machine.run("rm", f"{SYSTEM}/manager.service")
+
+
+@pytest.mark.nightly
+def test_the_unit_of_a_user_starts_in_the_manager_of_a_user(machine: Machine) -> None:
+    """Such a manager has no privileges: a setting that drops capabilities keeps a unit from
+    starting there."""
+    with manager_of_a_user(machine) as as_user:
+        as_user("vramctl", "install", "--yes", code=2)  # the machine's: for root
+        endpoint = f"ipc://{RUNTIME}/vram-arbiter/arbiter.sock"
+        status = as_user("vramctl", "status", "--json", "--endpoint", endpoint)
+        assert json.loads(status)["phase"] == "serving"
+
+
+ROBOT = "vram-arm1"
+TUNNEL = f"vram-remote@{ROBOT}@127.0.0.1"
+KEY = f"{HOME}/.config/vram-arbiter/arm1"
+
+
+@contextmanager
+def server_of_robots(machine: Machine) -> Iterator[None]:
+    """Start sshd as this machine configures it, with the drop-in of the installation."""
+    machine.run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", "/run/host_key")
+    machine.write(
+        f"{SYSTEM}/robots.service",
+        "[Service]\nRuntimeDirectory=sshd\nExecStart=/usr/sbin/sshd -D -e -h /run/host_key\n"
+        "StandardError=append:/run/logs/robots.log\n",
+    )
+    machine.run("systemctl", "daemon-reload")
+    machine.start("robots.service")
+    yield
+    machine.run("systemctl", "stop", "robots.service")
+    machine.run("rm", f"{SYSTEM}/robots.service")
+    machine.run("userdel", ROBOT)
+    machine.run("rm", "-r", "/etc/ssh/vram-guests")
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(not os.access("/usr/sbin/sshd", os.X_OK), reason="needs openssh-server")
+def test_the_unit_of_a_tunnel_keeps_it_and_gives_a_refused_one_up(machine: Machine) -> None:
+    """A robot beside its server: the key is let in, the session and the keeper are killed, and the
+    key is taken away."""
+    with manager_of_a_user(machine) as as_user, server_of_robots(machine):
+        settings = f"{HOME}/.config"
+        machine.write(
+            f"{settings}/systemd/user/vram-remote@.service.d/test.conf",
+            "[Service]\nRestartSec=100ms\nStandardError=append:/run/logs/tunnel.log\n",
+        )
+        options = f"{settings}/vram-arbiter/remote-{ROBOT}@127.0.0.1.env"
+        machine.write(options, f'REMOTE_OPTIONS="--identity {KEY}"\n')
+        host_key = machine.read("/run/host_key.pub")
+        machine.write(f"{settings}/vram-arbiter/known_hosts", f"127.0.0.1 {host_key}")
+        as_user("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", KEY)
+        authorize = ("vramctl", "remote", "authorize", f"{KEY}.pub", "--name", "arm1", "--install")
+        machine.run(*authorize)
+        as_user("systemctl", "--user", "daemon-reload")
+
+        def log() -> str:
+            return "\n".join(machine.read(f"/run/logs/{name}.log") for name in ("tunnel", "robots"))
+
+        def shown(*properties: str) -> list[str]:
+            told = as_user(
+                "systemctl", "--user", "show", TUNNEL, "--property", ",".join(properties)
+            )
+            found = dict(line.split("=", 1) for line in told.splitlines())
+            return [found[name] for name in properties]
+
+        def sessions() -> set[str]:
+            return {*machine.run("sh", "-c", f"pgrep -u {ROBOT}; true").split()}
+
+        def kill(*processes: str) -> None:
+            """Kill processes, and wait for a tunnel through another session."""
+            before = sessions()
+            machine.run("kill", "-KILL", *processes)
+
+            def again() -> bool | None:
+                now, (said,) = sessions(), shown("StatusText")
+                return True if now and not now & before and "is up" in said else None
+
+            answer_of(again, log)
+
+        as_user("systemctl", "--user", "start", TUNNEL)
+        (tunnel,) = json.loads(as_user("vramctl", "remote", "status", "--json"))["tunnels"]
+        assert (tunnel["state"], tunnel["role"]) == ("up", "guest")
+        (keeper,) = shown("MainPID")
+        kill(*sessions())
+        assert shown("MainPID", "NRestarts") == [keeper, "0"], "the keeper connects again itself"
+        kill(keeper)
+        assert shown("NRestarts") == ["1"]
+
+        machine.run("rm", f"/etc/ssh/vram-guests/{ROBOT}")
+        machine.run("kill", "-KILL", *sessions())
+        answer_of(lambda: True if shown("ActiveState") == ["failed"] else None, log)
+        assert shown("ExecMainStatus", "NRestarts") == ["1", "10"], "the eleventh start is none"
+        assert log().count("refuses the tunnel") == 9
+        assert "on the server: `vramctl remote authorize`" in log()
+
+        machine.run(*authorize)
+        as_user("systemctl", "--user", "reset-failed", TUNNEL)
+        as_user("systemctl", "--user", "start", TUNNEL)
+        as_user("systemctl", "--user", "stop", TUNNEL)
+        assert shown("ActiveState", "Result", "ExecMainStatus") == ["inactive", "success", "0"]
+        machine.run("rm", "-r", f"{settings}/systemd/user/vram-remote@.service.d")
 
 
 SERVED, GATEWAY = "llm.service", "vram-gateway.service"
@@ -396,6 +502,11 @@ def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
         lambda: True if "runner.sock" in machine.run("ls", "/run/vram-arbiter").split() else None,
         lambda: machine.log(f"{runner}.service"),
     )
+    guest = ("setpriv", "--reuid=games", "--regid=vram-guests", "--groups=vram-arbiter")
+    machine.run(*guest, *load)
+    state = ("vram-runner", "state", "--endpoint", "ipc:///run/vram-arbiter/runner.sock")
+    said = machine.run("sh", "-c", '! "$@" 2>&1', "sh", *guest, *state)
+    assert "a guest may not use runner" in said
     machine.run("vram-runner", "estop", "--reason", "a test", user="vram-robot")
     machine.start(reasoner)
     answer_of(

@@ -3,9 +3,12 @@ unmodified libzmq sockets, or sockets by hand.
 """
 
 import asyncio
+import grp
+import json
 import os
 import socket
 import stat
+import tempfile
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -16,6 +19,7 @@ import pytest
 import zmq
 import zmq.asyncio
 
+from tests.support.prepared import run
 from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.net.server import (
     IMAGES_MAX_BYTES,
@@ -272,3 +276,39 @@ def test_only_the_path_of_a_socket_is_served(endpoint: str, says: str) -> None:
         RouterServer(endpoint, refused)
     with pytest.raises(ConfigError, match=says):
         check_free(endpoint)
+
+
+GUEST = """
+import json, os, sys
+import msgpack
+from tests.support.wire import WireClient
+os.setgroups([int(group) for group in sys.argv[2:]])
+os.setresgid(65534, 65534, 65534); os.setresuid(65534, 65534, 65534)
+with WireClient(sys.argv[1]) as client:
+    client.send_raw(msgpack.packb({"id": 1, "op": "ping"}))
+    print(json.dumps(client.reply(1)))
+"""
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="needs root to act as another user")
+@pytest.mark.parametrize("member", [False, True])
+def test_a_guest_is_answered_by_a_refusal_alone(member: bool) -> None:
+    """A robot whose key named the runner's socket moved the server's own robot."""
+    guests = grp.getgrgid(60)  # `games`: each machine has it
+
+    async def scenario() -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "s.sock")
+            path.parent.chmod(0o711)
+            async with router_at(path, closed_to=guests.gr_name) as server:
+                path.chmod(0o666)
+                groups = [str(guests.gr_gid)] if member else []
+                words = [GUEST, f"ipc://{path}", *groups]
+                done = await asyncio.to_thread(run, "script", words, os.environ, PATIENCE_S)
+                assert done.returncode == 0, done.stderr
+                said = json.loads(done.stdout)
+                assert (said["ok"], len(server.peers)) == ((False, 0) if member else (True, 1))
+                assert said["re"] == 1
+                assert not member or said["message"] == "a guest may not use s"
+
+    with_server(scenario)

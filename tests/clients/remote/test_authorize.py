@@ -106,5 +106,5 @@ def test_a_damaged_key_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_user_that_exists_is_put_into_the_groups() -> None:
-    _, joined = Guest("arm1", key()).commands()
+    _, joined, _ = Guest("arm1", key()).commands()
     assert joined == ["usermod", "--append", "--groups", "vram-arbiter,vram-guests", "vram-arm1"]

@@ -38,6 +38,22 @@ def test_it_relays_both_ways_and_passes_an_end_on() -> None:
         assert ssh.wait(PATIENCE_S) == 0
 
 
+def test_it_frees_the_output_of_an_ssh_that_has_ended() -> None:
+    """Its starter reads that output to its end, and would wait as long as the server is silent."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = str(listener.getsockname()[1])
+        with subprocess.Popen(
+            [*COMMAND, "127.0.0.1", port], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+        ) as ssh:
+            assert ssh.stdin is not None
+            assert ssh.stderr is not None
+            peer, _ = listener.accept()
+            with peer:
+                ssh.stdin.close()
+                assert ssh.stderr.read() == b""
+                assert ssh.poll() is None, "it waits for the server's last words"
+
+
 @pytest.mark.parametrize("end", ["server", "ssh"])
 def test_it_ends_with_either_end(end: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:

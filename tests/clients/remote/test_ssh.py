@@ -28,8 +28,8 @@ def tunnel(folder: Path = Path("/run/r/remote/box"), **fields: object) -> Tunnel
 
 
 def test_the_command_line_pins_the_host_and_forwards_by_name() -> None:
-    words = tunnel(host="arm1@box:2201", sidecars=("grab",), doors=((8080, 8081),)).command()
-    assert words[-6:] == ["-l", "arm1", "-p", "2201", "--", "box"]
+    words = tunnel(host="arm1@box:2201", names=("arbiter", "grab"), doors=((8080, 8081),)).command()
+    assert words[-2:] == ["--", "ssh://arm1@box:2201"]
     told = [words[at + 1] for at, word in enumerate(words) if word == "-o"]
     assert {"StrictHostKeyChecking=yes", "UserKnownHostsFile=/etc/k", "BatchMode=yes"} <= {*told}
     assert [words[at + 1] for at, word in enumerate(words) if word == "-L"] == [
@@ -39,7 +39,9 @@ def test_the_command_line_pins_the_host_and_forwards_by_name() -> None:
     ]
 
 
-@pytest.mark.parametrize("host", ["", "-oProxyCommand=x", "a b", "a/b", "box:x", "../box", "a@b@c"])
+@pytest.mark.parametrize(
+    "host", ["", "-oProxyCommand=x", "a b", "a/b", "box:x", "box:99999", "../box", "a@b@c"]
+)
 def test_what_is_not_a_server_is_refused(host: str) -> None:
     with pytest.raises(ConfigError, match="expected a server"):
         folder_of(host, {"VRAM_ARBITER_RUNTIME": "/run/r"}, UID)
