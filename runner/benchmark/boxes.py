@@ -18,8 +18,7 @@ from vram_arbiter.clients.ray.fleet import Fleet
 from vram_arbiter.clients.ray.mapping import SeedsFailed
 from vram_arbiter.runner.benchmark.folder import RUN, Tell, keep
 from vram_arbiter.runner.benchmark.outcomes import SeedOutcome, unplayed
-from vram_arbiter.runner.benchmark.worker import Play, working
-from vram_arbiter.runner.cli.common import start_sidecars
+from vram_arbiter.runner.benchmark.worker import Play, open_sidecars, working
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.plain import JsonObject
 
@@ -128,5 +127,5 @@ def _flags(argv: Sequence[str], folder: str) -> argparse.Namespace:
 @contextlib.asynccontextmanager
 async def _opened(args: argparse.Namespace, cell: int) -> AsyncIterator[Play]:
     async with contextlib.AsyncExitStack() as stack:
-        await start_sidecars(args, stack)
+        await open_sidecars(args, stack)
         yield await stack.enter_async_context(working(args, cell))

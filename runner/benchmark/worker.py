@@ -18,13 +18,29 @@ from json import dumps
 from typing import Any
 
 from vram_arbiter.runner.benchmark.entries import entries_of, player_of
-from vram_arbiter.runner.cli.common import connect_arbiter, lease_rendering, warm_up
+from vram_arbiter.runner.cli.common import (
+    connect_arbiter,
+    lease_rendering,
+    start_sidecars,
+    warm_up,
+)
 from vram_arbiter.runner.cli.recording import conclude_recording, record_sim
 from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.plain import JsonObject
 
 Play = Callable[[int], Coroutine[Any, Any, JsonObject]]
 """Plays a seed and returns its outcome as it is committed. Raises what the recording lost."""
+
+
+async def open_sidecars(args: argparse.Namespace, stack: contextlib.AsyncExitStack) -> None:
+    """Start the sidecars of this machine that its workers share, until the stack ends.
+
+    Raises: ArbiterUnreachable before one starts, and what `start_sidecars` raises.
+    """
+    if args.skill and not args.no_arbiter:
+        async with contextlib.AsyncExitStack() as asking:
+            await connect_arbiter(args.arbiter, asking)
+    await start_sidecars(args, stack)
 
 
 @contextlib.asynccontextmanager

@@ -21,12 +21,7 @@ from vram_arbiter.runner.benchmark.outcomes import Cell, SeedOutcome, given_up
 from vram_arbiter.runner.benchmark.progress import ProgressLine
 from vram_arbiter.runner.benchmark.report import MAX_STEPS, PAGE, REPORT, table, write_report
 from vram_arbiter.runner.cli import Commands
-from vram_arbiter.runner.cli.common import (
-    add_skill_flags,
-    connect_arbiter,
-    install_signals,
-    start_sidecars,
-)
+from vram_arbiter.runner.cli.common import add_skill_flags, install_signals
 from vram_arbiter.runner.cli.numbers import not_negative_int, positive, positive_int
 from vram_arbiter.runner.cli.recording import add_record_flags
 from vram_arbiter.schemas.errors import ConfigError
@@ -170,11 +165,9 @@ async def _players(args: argparse.Namespace, stack: contextlib.AsyncExitStack) -
         fleet = stack.enter_context(connected(args.ray))
         return Boxes(fleet, args.argv, args.workers, deadline_s)
     from vram_arbiter.runner.benchmark.processes import Processes
+    from vram_arbiter.runner.benchmark.worker import open_sidecars
 
-    if args.skill and not args.no_arbiter:
-        async with contextlib.AsyncExitStack() as asking:  # before a sidecar starts
-            await connect_arbiter(args.arbiter, asking)
-    await start_sidecars(args, stack)
+    await open_sidecars(args, stack)
     return Processes(args.argv, args.workers, deadline_s)
 
 

@@ -102,8 +102,9 @@ def test_outcomes_are_told_and_lost_seeds_are_errors(tmp_path: Path, run_async: 
 
 
 def test_without_a_box_that_can_play_seeds_are_errors(tmp_path: Path, run_async: Any) -> None:
+    """Without an arbiter a box started its sidecar, whose exit code was the only reason given."""
     argv = ["benchmark", "--skill", "vram-arbiter/so101-navigate", "--no-videos"]
-    argv += ["--arbiter", f"ipc://{tmp_path}/none.sock"]
+    argv += ["--arbiter", f"ipc://{tmp_path}/none.sock", "--sidecar", "so101-grab"]
     told: list[SeedOutcome] = []
     fleet: Any = Here()
     run_async(boxes.Boxes(fleet, argv, 1, 60.0).play(0, [0, 1], tmp_path / "out", told.append))
@@ -197,3 +198,38 @@ def test_without_a_box_that_can_play_the_seeds_say_why(short_folder: Path, tmp_p
         argv = ["benchmark", *skill, "--ray", fleet.address, "--out", str(tmp_path / "out")]
         assert main(argv) == 1
     assert "ArbiterUnreachable" in episodes(tmp_path / "out")[0]["message"]
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(600)
+@pytest.mark.usefixtures("forked_workers")
+def test_each_box_starts_the_sidecar_and_its_model_gives_the_same_table(
+    short_folder: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from tests.support.boxes import Boxes
+    from tests.support.waiting import until
+    from vram_arbiter.clients.sync import Client
+    from vram_arbiter.testing.timeline import Timeline
+
+    local, away = tmp_path / "local", tmp_path / "away"
+    flags = ["benchmark", "--skill", "vram-arbiter/so101-grab", "--sidecar", "so101-grab"]
+    flags += ["--max-steps", "60", "--episodes", "4", "--no-videos"]
+    with Boxes(short_folder, nodes=2) as fleet:
+        assert main([*flags, "--ray", fleet.address, "--out", str(away)]) == 0
+        table = capfd.readouterr().out.replace(str(away), "")
+        for box in fleet.nodes:
+            granted = [one["consumer"] for one in Timeline(box.daemon).events("granted")]
+            assert "grab" in granted
+            assert Timeline(box.daemon).events("use_began")
+            with Client("test", endpoint=box.daemon.endpoint) as arbiter:
+                until(lambda arbiter=arbiter: not arbiter.status().leases)
+        for name, value in fleet.nodes[0].environ.items():
+            monkeypatch.setenv(name, value)
+        assert main([*flags, "--out", str(local)]) == 0
+    assert capfd.readouterr().out.replace(str(local), "") == table
+    assert [(e["seed"], e["success"], e["steps"]) for e in episodes(away)] == [
+        (e["seed"], e["success"], e["steps"]) for e in episodes(local)
+    ]
