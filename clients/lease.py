@@ -132,16 +132,13 @@ class AsyncLease:
 
         Raises: LeaseRevoking or LeaseLost before the block begins.
         """
-        use = AsyncUse(self, UseId(f"{self.lease_id}/{self._driver.new_id()}"), label)
+        use = AsyncUse(self, label)
         try:
             await use._begin()
+            use_context.enter(use.use_id, use.name)
             yield use
         finally:
-            use_context.leave(use.use_id)
-            self._departure.uses.discard(use.use_id)
-            self._driver.protocol.holdings.use_end(self._record, use.use_id, self._driver.now())
-            self._driver.pump()
-            self._departure.progress.changed()
+            use._end()
 
     async def oom(self, requested_bytes: int, allocated_bytes: int | None = None) -> None:
         """Report an allocation that failed: the arbiter raises the model's learned footprint."""
@@ -325,8 +322,8 @@ class AsyncLease:
 class AsyncUse:
     """A use on the holder's own lease; made by `AsyncLease.use`."""
 
-    def __init__(self, lease: AsyncLease, use_id: UseId, label: str) -> None:
-        self._use_id = use_id
+    def __init__(self, lease: AsyncLease, label: str) -> None:
+        self._use_id = UseId(f"{lease.lease_id}/{lease._driver.new_id()}")
         self._lease = lease
         self._label = label
         self.name = use_context.named(label, lease.lease_id)
@@ -353,7 +350,15 @@ class AsyncUse:
         except BaseException:
             lease._departure.uses.discard(self.use_id)
             raise
-        use_context.enter(self.use_id, self.name)
+
+    def _end(self) -> None:
+        """End the use, or what has begun of it, without waiting for the arbiter."""
+        lease, driver = self._lease, self._lease._driver
+        use_context.leave(self.use_id)
+        lease._departure.uses.discard(self.use_id)
+        driver.protocol.holdings.use_end(lease._record, self.use_id, driver.now())
+        driver.pump()
+        lease._departure.progress.changed()
 
 
 class AsyncForeignUse:

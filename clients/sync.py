@@ -19,13 +19,12 @@ import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager
-from functools import partial, wraps
-from threading import Thread, main_thread
+from functools import wraps
+from threading import Thread, current_thread, main_thread
 from types import TracebackType
 from typing import Any, Concatenate, Self
 
 import anyio
-from anyio.from_thread import BlockingPortal
 
 from vram_arbiter.clients import use_context
 from vram_arbiter.clients._protocol import records as r
@@ -42,11 +41,15 @@ from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 
 class _Portal:
-    """The background thread of one client. Raises BadState where it does not run."""
+    """The background thread of one client, whose event loop serves its connection while it is open.
+    Raises BadState where it does not run."""
 
-    def __init__(self) -> None:
+    def __init__(self, connection: AsyncClient) -> None:
         self._pid = os.getpid()
-        self._portal: BlockingPortal | None = None
+        self._connection = connection
+        self._running: asyncio.AbstractEventLoop | None = None
+        self._stop: asyncio.Event
+        self._left: Future[None]
         self._thread: Thread
 
     @property
@@ -54,37 +57,56 @@ class _Portal:
         """Whether this process is a fork of the one that made the client."""
         return os.getpid() != self._pid
 
-    def start(self) -> BlockingPortal:
-        """`start_blocking_portal` would wait for its thread where nothing runs any more: in a fork,
-        and at the end of a program that did not leave its block."""
-        started: Future[BlockingPortal] = Future()
+    @property
+    def _loop(self) -> asyncio.AbstractEventLoop:
+        if self._running is None or self.inherited:
+            what = "closed" if self._running is None else "made before a fork"
+            raise BadState(
+                f"this client was {what}", hint="make one in this process, and use it inside `with`"
+            )
+        return self._running
 
-        async def serve() -> None:
-            async with BlockingPortal() as portal:
-                started.set_result(portal)
-                await portal.sleep_until_stopped()
-
+    def start(self) -> None:
+        """Open the connection. Raises what that raises."""
+        opened: Future[None] = Future()
+        self._left = Future()
         self._thread = Thread(
-            target=anyio.run, args=(serve,), name="vram-arbiter-client", daemon=True
+            target=self._run, args=(opened,), name="vram-arbiter-client", daemon=True
         )
         self._thread.start()
-        self._portal = started.result()
-        return self._portal
-
-    def leave(self, connection: AbstractContextManager[Any]) -> None:
-        """Close the connection, and end the thread."""
         try:
-            connection.__exit__(None, None, None)
-        finally:
-            self.stop()
+            opened.result()
+        except BaseException:
+            opened.cancel()
+            raise
 
-    def stop(self) -> None:
-        if self._portal is not None:
-            portal, self._portal = self._portal, None
-            portal.call(portal.stop, True)  # calls of other threads end too
-            self._thread.join()
+    def _run(self, opened: Future[None]) -> None:
+        async def serve() -> None:
+            self._running, self._stop = asyncio.get_running_loop(), asyncio.Event()
+            try:
+                async with self._connection:
+                    if opened.set_running_or_notify_cancel():
+                        opened.set_result(None)
+                        await self._stop.wait()
+            finally:
+                self._running = None
 
-    def dropped(self, name: str, connection: AbstractContextManager[Any]) -> None:
+        try:
+            anyio.run(serve)  # at its end calls of other threads end too
+        except BaseException as error:  # noqa: BLE001  # of another thread
+            ends = self._left if opened.done() else opened
+            if ends.set_running_or_notify_cancel():
+                ends.set_exception(error)
+        else:
+            self._left.set_result(None)
+
+    def leave(self) -> None:
+        """Close the connection, and end the thread. Raises what that raises."""
+        self.soon(self._stop.set)
+        self._left.result()
+        self._thread.join()
+
+    def dropped(self, name: str) -> None:
         """Leave for a client that was entered, and is gone without an exit: collected in any
         thread, or left to the end of the program."""
         if self.inherited:
@@ -94,32 +116,40 @@ class _Portal:
             RuntimeWarning,
             stacklevel=2,
         )
-        self.abandon(connection)
+        self.abandon()
 
-    def abandon(self, connection: AbstractContextManager[Any]) -> None:
+    def abandon(self) -> None:
         """Leave, in whatever thread, or at the end of the program."""
         if self.inherited or not main_thread().is_alive():
             return  # the program ends, and its leases with it: no handler could run any more
         try:
             asyncio.get_running_loop()
         except RuntimeError:
-            self.leave(connection)
+            self.leave()
         else:  # a thread with a loop must not wait: it may be this client's, or another one's
-            Thread(target=self.leave, args=(connection,)).start()
+            Thread(target=self.leave).start()
 
     def call[T](self, work: Callable[..., Awaitable[T]], *arguments: Any, **named: Any) -> T:
         """Run `work` in the background thread and wait for it. Ctrl-C cancels it there too."""
-        if self._portal is None or self.inherited:
-            what = "closed" if self._portal is None else "made before a fork"
-            raise BadState(
-                f"this client was {what}", hint="make one in this process, and use it inside `with`"
-            )
-        future: Future[T] = self._portal.start_task_soon(partial(work, *arguments, **named))
+
+        loop = self._loop
+        if self._thread is current_thread():
+            raise BadState("this thread serves the client", hint="call it in another thread")
+
+        async def run() -> T:
+            return await work(*arguments, **named)
+
+        future = asyncio.run_coroutine_threadsafe(run(), loop)
         try:
             return future.result()
         except BaseException:
             future.cancel()
             raise
+
+    def soon(self, work: Callable[..., object], *arguments: Any) -> None:
+        """Run `work` in the background thread, without waiting for it, before what is called
+        later."""
+        self._loop.call_soon_threadsafe(work, *arguments)
 
 
 class _Blocking[Twin]:
@@ -210,13 +240,13 @@ class Lease(_Blocking[AsyncLease]):
     @contextmanager
     def use(self, label: str = "") -> Iterator["Use"]:
         """Mark a busy interval: the holder is not evicted inside it; see `AsyncLease.use`."""
-        interval = self._twin.use(label)
-        use = self._portal.call(interval.__aenter__)
-        use_context.enter(use.use_id, use.name)  # the background task entered it for itself only
+        use = AsyncUse(self._twin, label)
         try:
+            self._portal.call(use._begin)
+            use_context.enter(use.use_id, use.name)
             yield Use(self._portal, use)
         finally:
-            self._portal.call(interval.__aexit__, None, None, None)
+            self._portal.soon(use._end)
 
 
 class Use(_Blocking[AsyncUse]):
@@ -281,19 +311,13 @@ class Client(_Blocking[AsyncClient]):
         connect_timeout_s: float = CONNECT_TIMEOUT_S,
     ) -> None:
         made = AsyncClient(name, endpoint=endpoint, role=role, connect_timeout_s=connect_timeout_s)
-        super().__init__(_Portal(), made)
-        self._connection: AbstractContextManager[Any]
+        super().__init__(_Portal(made), made)
         self._dropped: weakref.finalize[Any, Any]
 
     # -- connection --------------------------------------------------------------------------------
     def __enter__(self) -> Self:
-        self._connection = self._portal.start().wrap_async_context_manager(self._twin)
-        try:
-            self._connection.__enter__()
-        except BaseException:
-            self._portal.stop()
-            raise
-        self._dropped = weakref.finalize(self, self._portal.dropped, self.name, self._connection)
+        self._portal.start()
+        self._dropped = weakref.finalize(self, self._portal.dropped, self.name)
         return self
 
     def __exit__(
@@ -304,7 +328,7 @@ class Client(_Blocking[AsyncClient]):
     ) -> None:
         self._dropped.detach()
         if not self._portal.inherited:
-            self._portal.leave(self._connection)
+            self._portal.leave()
 
     @property
     def name(self) -> str:

@@ -14,15 +14,14 @@ import time
 import weakref
 from collections.abc import AsyncIterator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractAsyncContextManager
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 from vram_arbiter.clients import use_context
-from vram_arbiter.clients.lease import AsyncUse
-from vram_arbiter.clients.sync import Client, Lease
+from vram_arbiter.clients.sync import Client, Lease, Use
 from vram_arbiter.schemas.errors import (
     LeaseExpired,
     LeaseLost,
@@ -63,16 +62,11 @@ class Owner(Protocol):
 class Interval:
     """A use that several calls share; `open` while more may join, which counts as a call."""
 
-    use: AbstractAsyncContextManager[AsyncUse]
-    begun: AsyncUse
-    loop: asyncio.AbstractEventLoop
+    use: AbstractContextManager[Use]
+    use_id: str
+    name: str
     calls: int = 2
     open: bool = True
-
-    def end(self) -> None:
-        """End the use. Any thread may call."""
-        leaving: Any = self.use.__aexit__(None, None, None)
-        self.loop.call_soon_threadsafe(self.loop.create_task, leaving)
 
 
 class Residency:
@@ -126,7 +120,7 @@ class Residency:
     @contextlib.contextmanager
     def _inside(self, interval: Interval) -> Iterator[None]:
         outside = _within.set(_within.get() | {id(self)})
-        use_context.enter(interval.begun.use_id, interval.begun.name)
+        use_context.enter(interval.use_id, interval.name)
         try:
             yield
         finally:
@@ -151,17 +145,20 @@ class Residency:
             while (joined := self._join()) is None:
                 lease = self._loaded()
                 try:
-                    return lease._portal.call(self._begin, lease, label)
+                    return self._begin(lease, label)
                 except LEFT:
                     continue
             return joined
 
-    async def _begin(self, lease: Lease, label: str) -> Interval:
-        """Runs on the client's loop."""
-        use, loop = lease._twin.use(label), asyncio.get_running_loop()
-        self._interval = interval = Interval(use, await use.__aenter__(), loop)
-        loop.call_later(SHARE_S, self._close, interval)
+    def _begin(self, lease: Lease, label: str) -> Interval:
+        use, name = lease.use(label), use_context.named(label, lease.lease_id)
+        self._interval = interval = Interval(use, use.__enter__().use_id, name)
+        lease._portal.soon(self._share, interval)
         return interval
+
+    def _share(self, interval: Interval) -> None:
+        """Let calls join for SHARE_S. Runs on the client's loop."""
+        asyncio.get_running_loop().call_later(SHARE_S, self._close, interval)
 
     def _close(self, interval: Interval) -> None:
         interval.open = False
@@ -172,7 +169,7 @@ class Residency:
             interval.calls -= 1
             over = not interval.calls
         if over:
-            interval.end()
+            interval.use.__exit__(None, None, None)
 
     def _loaded(self) -> Lease:
         lease = self._lease
@@ -220,7 +217,7 @@ def _connected(name: str) -> Client:
     """A client that is left, with its leases, when it is collected."""
     client = Client(name).__enter__()
     client._dropped.detach()  # which would warn
-    weakref.finalize(client, client._portal.abandon, client._connection)
+    weakref.finalize(client, client._portal.abandon)
     return client
 
 

@@ -59,6 +59,19 @@ def test_revoked_between_uses_in_a_worker_thread(client: Client, spec: Spec) -> 
     assert not loop_thread.is_set()
 
 
+def test_a_call_in_the_clients_own_thread_is_refused(client: Client) -> None:
+    refused = threading.Event()
+
+    def hinted(_: str) -> None:
+        with pytest.raises(BadState, match="serves the client"):
+            client.status()
+        refused.set()
+
+    client.on_prepare(hinted)
+    client.prepare(client.name)
+    assert refused.wait(PATIENCE_S)
+
+
 def test_events_can_be_iterated(client: Client, spec: Spec) -> None:
     kinds: list[str] = []
     seen = threading.Event()
