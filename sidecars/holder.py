@@ -2,7 +2,7 @@
 
 `python -m vram_arbiter.sidecars.holder fake:FOLDER|cuda[:N]|none` reads one request a line from
 stdin, a word and sizes in bytes, and answers each with one JSON object on stdout. It ends with its
-input. Must not know leases.
+input, and with a request that fails. Must not know leases.
 """
 
 import json
@@ -16,9 +16,8 @@ from functools import partial
 from typing import Any, Final
 
 from vram_arbiter.schemas.defaults import MIB
-from vram_arbiter.schemas.errors import ModelError, VramError
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.sidecars.device.memory import Block, DeviceMemory, fill
+from vram_arbiter.sidecars.device.memory import Block, fill
 from vram_arbiter.sidecars.device.open import open_memory
 from vram_arbiter.sidecars.host_weights import HostWeights
 from vram_arbiter.sidecars.parent import end_with
@@ -31,18 +30,13 @@ NF4: Final = {"compute_dtype": "float32", "min_params_to_quantize": 0, "skip_mod
 
 
 class Holder:
-    """Bytes of this process. Requests raise OutOfMemory, and what their libraries raise."""
+    """Bytes of this process. Raises NoGpu; requests raise OutOfMemory, and what their libraries
+    raise."""
 
-    _memory: DeviceMemory
-
-    def __init__(self) -> None:
+    def __init__(self, device: str) -> None:
+        self._memory = open_memory(device, "selftest")
         self._blocks: list[Block] = []
         self._numbers: Any = None
-
-    def begin(self, device: str) -> JsonMap:
-        """Open the device: the first request, by the program's argument. Raises NoGpu."""
-        self._memory = open_memory(device, "selftest")
-        return {"pid": os.getpid()}
 
     def fill(self, size_bytes: int) -> JsonMap:
         """Make the context, and allocate beside it."""
@@ -57,16 +51,13 @@ class Holder:
         self._memory.empty_cache()
         return {}
 
-    def number(self, size_bytes: int) -> JsonMap:
-        """Write a number to each eight bytes of a tensor, whose sum `sum` tells."""
+    def sum(self, size_bytes: int) -> JsonMap:
+        """Add numbers up on the GPU, one of each eight bytes; the first request puts them there."""
         import torch
 
-        self._memory.touch()
-        self._numbers = torch.arange(size_bytes // 8, device=self._memory.torch_device)
-        return self.sum()
-
-    def sum(self) -> JsonMap:
-        """Add the numbers up, on the GPU."""
+        if self._numbers is None:
+            self._memory.touch()
+            self._numbers = torch.arange(size_bytes // 8, device=self._memory.torch_device)
         return {"sum": int(self._numbers.sum())}
 
     def copies(self, size_bytes: int) -> JsonMap:
@@ -86,31 +77,28 @@ class Holder:
         return self._timed_copies(network, weights)
 
     def _timed_copies(self, network: Any, weights: HostWeights) -> JsonMap:
-        """Return seconds of the first copy of a sidecar's weights, and medians of plain copies,
-        each one `cudaMemcpyAsync` of all bytes and a synchronization: from ordinary and from
-        page-locked memory."""
+        """Return GB/s of the first copy of a sidecar's weights, and of plain copies (medians), each
+        one `cudaMemcpyAsync` of all bytes and a synchronization: from ordinary and from page-locked
+        memory."""
         import torch
 
         self._memory.touch()
         device, on_cpu = self._memory.torch_device, self._memory.torch_device == "cpu"
         restore = weights.own if on_cpu else lambda: network.to(device)
-        answer = {"bytes": weights.size_bytes, "restore_s": self._seconds(restore)}
+        times = {"restore": self._seconds(restore)}
         plain = torch.ones(weights.size_bytes, dtype=torch.uint8)
         there = plain.to(device, copy=True)  # the allocator has room from here on
-        sources = {"pageable_s": plain} | ({} if on_cpu else {"page_locked_s": plain.pin_memory()})
+        sources = {"pageable": plain} | ({} if on_cpu else {"page_locked": plain.pin_memory()})
         for name, source in sources.items():
-            times = [self._seconds(partial(there.copy_, source)) for _ in range(REPEATS)]
-            answer[name] = statistics.median(times)
-        return answer
+            copy = partial(there.copy_, source)
+            times[name] = statistics.median(self._seconds(copy) for _ in range(REPEATS))
+        return {name: weights.size_bytes / taken_s / 1e9 for name, taken_s in times.items()}
 
     def _seconds(self, work: Callable[[], object]) -> float:
         self._memory.empty_cache()  # waits for the GPU
         began_s = time.perf_counter()
         work()
-        if self._memory.torch_device != "cpu":
-            import torch
-
-            torch.cuda.synchronize()
+        self._memory.empty_cache()
         return time.perf_counter() - began_s
 
     def nf4(self) -> JsonMap:
@@ -144,24 +132,15 @@ def _size(network: Any) -> int:
     return sum(one.numel() * one.element_size() for one in network.parameters())
 
 
-def _answer(work: Callable[[], JsonMap]) -> JsonMap:
-    """Any failure is an answer."""
-    try:
-        return work()
-    except VramError as error:
-        return {"error": error.to_wire()}
-    except Exception as error:  # noqa: BLE001
-        return {"error": ModelError(f"{type(error).__name__}: {error}").to_wire()}
-
-
 def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
-    holder = Holder()
-    print(json.dumps(_answer(partial(holder.begin, sys.argv[1]))), flush=True)
-    for line in sys.stdin:
-        word, *sizes = line.split()
-        request = getattr(holder, word)
-        print(json.dumps(_answer(partial(request, *map(int, sizes)))), flush=True)
+    try:
+        holder = Holder(sys.argv[1])
+        for line in sys.stdin:
+            word, *sizes = line.split()
+            print(json.dumps(getattr(holder, word)(*map(int, sizes))), flush=True)
+    except Exception as error:  # noqa: BLE001  any failure is an answer
+        print(json.dumps({"error": f"{type(error).__name__}: {error}"}), flush=True)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ class DemoProgram:
     name: str
     process: asyncio.subprocess.Process
     log: Path
+    stopped: bool = False  # by this process
 
     def tail(self) -> str:
         """The last lines that it printed, for error messages."""
@@ -45,15 +46,20 @@ class Programs:
     environ: Mapping[str, str]
     running: dict[str, DemoProgram] = field(default_factory=dict)
 
-    async def start(self, name: str, package: str, *arguments: str) -> DemoProgram:
+    async def start(
+        self, name: str, package: str, *arguments: str, asked: bool = False, **environ: str
+    ) -> DemoProgram:
         """Start `python -m vram_arbiter.PACKAGE ARGUMENTS`, which dies with this process; its
-        output goes to `<log_dir>/<name>.log`."""
+        output goes to `<log_dir>/<name>.log`. `asked`: it reads from this process, and answers on
+        its standard output."""
         log = self.log_dir / f"{name}.log"
         with log.open("wb") as sink:
+            piped = asyncio.subprocess.PIPE
             process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", f"vram_arbiter.{package}", *arguments,
-                stdin=asyncio.subprocess.DEVNULL, stdout=sink, stderr=sink,
-                env=dict(os.environ) | traces.environ() | dict(self.environ),
+                stdin=piped if asked else asyncio.subprocess.DEVNULL,
+                stdout=piped if asked else sink, stderr=sink,
+                env=dict(os.environ) | traces.environ() | dict(self.environ) | environ,
                 preexec_fn=dying_with_parent(),
             )  # fmt: skip
         program = self.running[name] = DemoProgram(name, process, log)
@@ -66,19 +72,20 @@ class Programs:
     def check(self) -> None:
         """Raise SidecarUnavailable for a program that ended by itself."""
         for program in self.running.values():
-            if program.process.returncode is not None:
+            if program.process.returncode is not None and not program.stopped:
                 raise SidecarUnavailable(
                     f"{program.name} ended with exit code "
                     f"{program.process.returncode}:\n{program.tail()}",
                     hint=f"its whole output is in {program.log}",
                 )
 
-    async def stop(self, name: str) -> None:
-        """SIGTERM, then SIGKILL after a grace period."""
+    async def stop(self, name: str, number: signal.Signals = signal.SIGTERM) -> None:
+        """Send the signal, and SIGKILL after a grace period."""
         program = self.running[name]
         if program.process.returncode is not None:
             return
-        program.process.send_signal(signal.SIGTERM)
+        program.stopped = True
+        program.process.send_signal(number)
         try:
             await asyncio.wait_for(program.process.wait(), STOP_GRACE_S)
         except TimeoutError:

@@ -2,7 +2,10 @@
 
 import argparse
 import asyncio
+import json
 import logging
+import tempfile
+import time
 from pathlib import Path
 from typing import Final
 
@@ -12,10 +15,11 @@ from vram_arbiter.clients.cli.doctor.machine import ask_nvml
 from vram_arbiter.clients.cli.replies import NO, OK
 from vram_arbiter.clients.selftest import report
 from vram_arbiter.clients.selftest.bed import READING_S, answered_within
-from vram_arbiter.clients.selftest.rows import ROWS
-from vram_arbiter.clients.selftest.run import Outcome, Trial, selftest
+from vram_arbiter.clients.selftest.rows import LAST, ROWS
+from vram_arbiter.clients.selftest.run import judged, made, open_idle
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.sizes import format_bytes
 
@@ -54,49 +58,52 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
 
 def run(args: argparse.Namespace) -> int:
     logging.getLogger("vram_arbiter.clients").setLevel(logging.ERROR)  # a row kills the daemon
-    results = asyncio.run(_run(args))
-    return OK if all(one.verdict in ("pass", "skipped") for one in results) else NO
+    return asyncio.run(_run(args))
 
 
-async def _run(args: argparse.Namespace) -> list[Outcome]:
-    index, why = await _index(args.gpu)
-    simulated, gpus, results = index is None, list[Gpu](), list[Outcome]()
+async def _run(args: argparse.Namespace) -> int:
+    deadline_s, outcomes = time.monotonic() + args.within, list[JsonMap]()
+    gpu, why = await _opened(args.gpu, args.memory)
+    simulated = gpu is None
 
-    def begun(gpu: Gpu) -> None:
-        gpus.append(gpu)
-        print(printable(f"{gpu.name}, {gpu.driver}, at most {format_bytes(args.memory)} of it"))
-        if simulated:
-            print(printable(f"{report.SIMULATED} ({why})"), flush=True)
-
-    def tell(result: Outcome) -> None:
-        results.append(result)
-        line = report.line_of(result, simulated=simulated)
+    def tell(outcome: JsonMap) -> None:
+        outcomes.append(outcome)
+        line = report.line_of(outcome, simulated=simulated)
         print("\n".join(terminal.folded(line, 4, terminal.columns())), flush=True)
 
     rows = [row for row in ROWS if args.row is None or row.id in args.row]
-    await selftest(Trial(index, args.memory, args.within, rows), begun, tell)
-    told = report.told(gpus[0], results, simulated=simulated)
+    with tempfile.TemporaryDirectory(prefix="vram-st", ignore_cleanup_errors=True) as folder:
+        async with made(folder, gpu, args.memory, {row.skill for row in rows} - {""}) as bed:
+            about = f"{bed.gpu.name}, {bed.gpu.driver}, at most {format_bytes(args.memory)} of it"
+            print(printable(about))
+            if simulated:
+                print(printable(f"{report.SIMULATED} ({why})"), flush=True)
+            for row in rows:
+                tell(await judged(row, bed, deadline_s - time.monotonic()))
+        tell(await judged(LAST, bed, LAST.limit_s))
+    told = report.told(bed.gpu, outcomes, simulated=simulated)
     print(told["summary"])
-    for place, written in ((args.json, report.as_json), (args.report, report.as_markdown)):
-        if place is not None:
-            files.replace(place, written(told))
-    return results
+    if args.json:
+        files.replace(args.json, json.dumps(told, indent=2) + "\n")
+    if args.report:
+        files.replace(args.report, report.markdown(told))
+    return OK if all(one["verdict"] in ("pass", "skipped") for one in outcomes) else NO
 
 
-async def _index(gpu: str) -> tuple[int | None, str]:
-    """Return the number of the GPU; None: a simulated one, and why. Raises ConfigError for a GPU
-    without memory of its own, ProbeFailed where the driver hangs."""
-    if gpu == FAKE:
+async def _opened(wanted: str, memory_bytes: int) -> tuple[Gpu | None, str]:
+    """Open the GPU that is asked for; None: a simulated one, and why. Raises ConfigError for a GPU
+    without memory of its own, ProbeFailed where the driver hangs, and what `open_idle` raises."""
+    if wanted == FAKE:
         return None, "--gpu fake"
     nvml = await answered_within(READING_S, ask_nvml)
-    if gpu == AUTO and nvml.error in NO_DRIVER:
+    if wanted == AUTO and nvml.error in NO_DRIVER:
         return None, nvml.problem
     if nvml.without_memory:
         raise ConfigError(
             "this GPU uses the machine's memory, of which no row can tell its own part",
             hint="vramctl selftest --gpu fake; vramctl doctor examines the machine",
         )
-    return 0 if gpu == AUTO else int(gpu), ""
+    return await open_idle(0 if wanted == AUTO else int(wanted), memory_bytes), ""
 
 
 def _gpu(written: str) -> str:

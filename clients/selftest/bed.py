@@ -8,23 +8,20 @@ import json
 import os
 import sys
 import time
-from asyncio.subprocess import PIPE, Process
 from collections.abc import AsyncIterator, Callable, Collection
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from pathlib import Path
 from signal import SIGKILL
 from typing import Any, Final
 
 from vram_arbiter.clients.calibration.gpu import Gpu, Reading
-from vram_arbiter.clients.cli.demo_programs import Programs
+from vram_arbiter.clients.cli.demo_programs import DemoProgram, Programs
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.configs import configs_folder
-from vram_arbiter.clients.foreign.program import dying_with_parent, send_below
 from vram_arbiter.clients.sidecar.build import CLIENTS
 from vram_arbiter.schemas.defaults import VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
-from vram_arbiter.schemas.errors import ProbeFailed, SidecarUnavailable, from_wire
+from vram_arbiter.schemas.errors import ProbeFailed, SidecarUnavailable
 from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.threads import in_daemon_thread
@@ -33,14 +30,10 @@ from vram_arbiter.schemas.sizes import format_bytes
 READING_S: Final = 5.0
 """Above the daemon's own limit of a reading (2 s): a GPU that takes longer hangs."""
 POLL_S: Final = 0.002
-END_S: Final = 10.0
 MODEL_S: Final = 90.0
 """Imports of three sidecars at once, on two busy cores."""
-HOLDER: Final = (sys.executable, "-m", "vram_arbiter.sidecars.holder")
-RUN: Final = (
-    sys.executable, "-m", "vram_arbiter.clients", "run", "--min-residency", "0", "--on-revoke",
-    "term",
-)  # fmt: skip
+HOLDER: Final = "sidecars.holder"
+RUN: Final = ("clients", "run", "--min-residency", "0", "--on-revoke", "term")
 
 
 class Skipped(Exception):
@@ -67,45 +60,18 @@ async def answered_within[T](limit_s: float, work: Callable[[], T]) -> T:
         raise ProbeFailed(late, hint="see nvidia-smi and dmesg") from None
 
 
-@dataclass(slots=True)
-class Holder:
-    """A process of `sidecars.holder`; `process` is it, or the `vramctl run` that started it."""
-
-    process: Process
-    log: Path
-    pid: int = 0
-
-    async def ask(self, word: str, *sizes: int) -> JsonMap:
-        """Raises the process's typed error, and SidecarUnavailable where it has ended."""
-        assert self.process.stdin is not None
-        self.process.stdin.write(f"{' '.join([word, *map(str, sizes)])}\n".encode())
-        return await self.answer()
-
-    async def answer(self) -> JsonMap:
-        """Return its next line; the first one comes unasked. Raises as `ask`."""
-        assert self.process.stdout is not None
-        line = await self.process.stdout.readline()
-        if not line:
-            told = self.log.read_text(errors="replace").splitlines()[-1:]
-            raise SidecarUnavailable(f"a holder ended: {''.join(told)}")
-        answer: JsonMap = json.loads(line)
-        if "error" in answer:
-            raise from_wire(answer["error"])
-        return answer
-
-    async def end(self) -> None:
-        """End it in order, and by force after END_S."""
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        with suppress(TimeoutError):
-            await asyncio.wait_for(self.process.wait(), END_S)
-        await self.kill()
-
-    async def kill(self) -> None:
-        """End it with SIGKILL, if it has not ended; its program dies with it."""
-        if self.process.returncode is None:
-            send_below(self.process.pid, SIGKILL)
-        await self.process.wait()
+async def ask(holder: DemoProgram, word: str, *sizes: int) -> JsonMap:
+    """Return the answer of a holder to a request of `sidecars.holder`. Raises SidecarUnavailable
+    where it has failed."""
+    asked, answers = holder.process.stdin, holder.process.stdout
+    assert asked is not None
+    assert answers is not None
+    asked.write(f"{' '.join([word, *map(str, sizes)])}\n".encode())
+    line = await answers.readline()
+    answer: JsonMap = json.loads(line) if line else {"error": f"it ended: {holder.tail()}"}
+    if "error" in answer:
+        raise SidecarUnavailable(answer["error"])
+    return answer
 
 
 @dataclass(slots=True)
@@ -153,41 +119,34 @@ class Bed:
 
     async def restart_daemon(self) -> None:
         """Kill the daemon, and start it again on the same files."""
-        process = self.programs.running["arbiter"].process
-        send_below(process.pid, SIGKILL)
-        await process.wait()
+        await self.programs.stop("arbiter", SIGKILL)
         await self.programs.start("arbiter", "arbiter", *self.daemon)
 
     @asynccontextmanager
     async def holder(
         self, lease: str = "", size_bytes: int | None = None, **environ: str
-    ) -> AsyncIterator[Holder]:
+    ) -> AsyncIterator[DemoProgram]:
         """Start a process that holds a context and so many bytes (None: neither), and end it again:
         under a lease of that name (`vramctl run`), or without one, which makes it a stowaway. Its
         bytes are back at the end of the block.
 
-        Raises Skipped, Missed, SidecarUnavailable, and the process's errors.
+        Raises Skipped, Missed, and SidecarUnavailable with the process's error.
         """
         if not self.simulated:
             need("torch", extra="sidecars")
-        used_bytes, command = await self.used(), [*HOLDER, self.gpu.device]
+        used_bytes, command = await self.used(), [HOLDER, self.gpu.device]
         if lease:
             need_of = ("--vram", f"{self.lease_bytes}B", "--gpu", self.gpu.uuid, "--name", lease)
-            command = [*RUN, *need_of, "--", *command]
-        path = self.programs.log_dir / "holder.log"
-        with path.open("wb") as log:
-            process = await asyncio.create_subprocess_exec(
-                *command, stdin=PIPE, stdout=PIPE, stderr=log, preexec_fn=dying_with_parent(),
-                env=dict(os.environ) | dict(self.programs.environ) | environ,
-            )  # fmt: skip
-        made = Holder(process, path)
+            program = (sys.executable, "-m", f"vram_arbiter.{HOLDER}", self.gpu.device)
+            command = [*RUN, *need_of, "--", *program]
+        name = lease or "stowaway"
+        made = await self.programs.start(name, *command, asked=True, **environ)
         try:
-            made.pid = (await made.answer())["pid"]
             if size_bytes is not None:
-                await made.ask("fill", size_bytes)
+                await ask(made, "fill", size_bytes)
             yield made
         finally:
-            await made.end()
+            await self.programs.stop(name)
         await self.returned(used_bytes)
 
     @asynccontextmanager
@@ -203,7 +162,7 @@ class Bed:
             await self.programs.start(
                 name, "sidecars", "--name", name, "--rskill", name, "--device", self.gpu.device,
                 "--gpu", self.gpu.uuid, "--footprint", str(self.memory_bytes),
-                "--min-residency-s", "0", "--parent", str(os.getpid()),
+                "--min-residency-s", "0",
             )  # fmt: skip
         async with CLIENTS[manifest.kind](f"ipc://{self.programs.log_dir}/{skill}.sock") as client:
             try:

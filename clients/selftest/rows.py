@@ -9,19 +9,28 @@ import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
+from signal import SIGKILL
 from typing import Any, Final
 
-from vram_arbiter.clients.calibration.model import ASKED
+from vram_arbiter.clients.calibration.model import observation_of
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.foreign.actions import Action
 from vram_arbiter.clients.foreign.cuda_checkpoint import CheckpointAction, CudaDriver
 from vram_arbiter.clients.foreign.program import is_below
-from vram_arbiter.clients.selftest.bed import MODEL_S, Bed, Missed, Skipped, answered_within, need
+from vram_arbiter.clients.selftest.bed import (
+    MODEL_S,
+    Bed,
+    Missed,
+    answered_within,
+    ask,
+    need,
+)
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import MIB, VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
-from vram_arbiter.schemas.errors import CheckpointUnsupported, VramError, WaitTimeout
-from vram_arbiter.schemas.manifest import Kind, RSkillManifest
+from vram_arbiter.schemas.errors import VramError, WaitTimeout
+from vram_arbiter.schemas.manifest import RSkillManifest
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
@@ -110,9 +119,9 @@ async def context(bed: Bed) -> Found:
     """Measure the bytes of a process that has only touched the GPU."""
     async with bed.holder() as holder:
         before = await bed.used()
-        await holder.ask("fill", 0)
+        await ask(holder, "fill", 0)
         now = await bed.read()
-        named = (now.processes or {}).get(holder.pid)
+        named = (now.processes or {}).get(holder.process.pid)
         remark = "its pid is not listed" if named is None else f"listed: {named / MIB:.0f} MiB"
         return (now.used_bytes - before) / MIB, remark
 
@@ -122,11 +131,11 @@ async def lag_free(bed: Bed) -> Found:
     """Measure the time from a free to a reading that shows it."""
     async with bed.holder(size_bytes=0) as holder:
         empty = await bed.used()
-        await holder.ask("fill", bed.part_bytes)
+        await ask(holder, "fill", bed.part_bytes)
         shown = await bed.used() - empty
         if shown < bed.part_bytes - VERIFY_TOLERANCE_BYTES:
             raise Missed(f"{shown / MIB:.0f} MiB of {bed.part_bytes / MIB:.0f} are seen")
-        await holder.ask("free")
+        await ask(holder, "free")
         return await bed.returned(empty) * 1000, "the context stays"
 
 
@@ -135,21 +144,21 @@ async def lag_exit(bed: Bed) -> Found:
     """Measure the time from a process's end to a reading that shows it."""
     before = await bed.used()
     async with bed.holder(size_bytes=bed.part_bytes) as holder:
-        await holder.end()
+        await bed.programs.stop(holder.name)
         return await bed.returned(before) * 1000, "context and weights"
 
 
 @row("times", source="performance.md", most=2, hardware=True)
 async def restore(bed: Bed) -> Found:
     """Measure the time of a restore, in times of one cudaMemcpy."""
-    ours, plain = await _rates(bed, "restore_s", "pageable_s")
+    ours, plain = await _rates(bed, "restore", "pageable")
     return plain / ours, f"{ours:.1f} GB/s, cudaMemcpy {plain:.1f} GB/s"
 
 
 @row("times", source="CUDA C++ Best Practices: pinned memory", least=1, hardware=True)
 async def page_locked(bed: Bed) -> Found:
     """Measure the speed of page-locked memory, in times of pageable."""
-    locked, plain = await _rates(bed, "page_locked_s", "pageable_s")
+    locked, plain = await _rates(bed, "page_locked", "pageable")
     return locked / plain, f"{locked:.1f} GB/s, pageable {plain:.1f} GB/s"
 
 
@@ -157,8 +166,8 @@ async def _rates(bed: Bed, *copies: str) -> list[float]:
     """Return GB/s of copies, which are timed once for both of their rows."""
     if not bed.copies:
         async with bed.holder() as holder:
-            bed.copies = await holder.ask("copies", bed.memory_bytes // 8)
-    return [bed.copies["bytes"] / bed.copies[name] / 1e9 for name in copies]
+            bed.copies = await ask(holder, "copies", bed.memory_bytes // 8)
+    return [bed.copies[name] for name in copies]
 
 
 @row("", source="the CPU's answer", most=1e-3, hardware=True)
@@ -166,7 +175,7 @@ async def nf4(bed: Bed) -> Found:
     """Measure the relative difference of NF4 on GPU and CPU."""
     need("torch", "bitsandbytes", extra="sidecars")
     async with bed.holder() as holder:
-        told = await holder.ask("nf4")
+        told = await ask(holder, "nf4")
     if told["bytes"] * 8 != told["of_bytes"]:
         raise Missed(f"{told['of_bytes']} bytes became {told['bytes']}, not an eighth")
     return told["difference"], "an eighth of float32"
@@ -176,20 +185,16 @@ async def nf4(bed: Bed) -> Found:
 async def checkpoint(bed: Bed, action: Action | None = None) -> Found:
     """Measure the bytes of a suspended process, which then continues with its numbers."""
     action = action or CheckpointAction(CudaDriver(), CHECKPOINT_S)
-    try:
-        await answered_within(CHECKPOINT_S, action.check)
-    except CheckpointUnsupported as error:
-        raise Skipped(f"{error.message}; {error.hint}") from None
+    await answered_within(CHECKPOINT_S, action.check)
     before = await bed.used()
     # torch can share its expandable segments with processes, and shared memory stays (IPC)
     async with bed.holder(PYTORCH_CUDA_ALLOC_CONF="expandable_segments:False") as holder:
-        numbers = await holder.ask("number", bed.part_bytes)
-        _, gone_ms = await _timed(answered_within(CHECKPOINT_S, lambda: action.free([holder.pid])))
+        numbers, pids = await ask(holder, "sum", bed.part_bytes), [holder.process.pid]
+        _, gone_ms = await _timed(answered_within(CHECKPOINT_S, lambda: action.free(pids)))
         await bed.returned(before)
         left = await bed.used() - before
-        back = answered_within(CHECKPOINT_S, lambda: action.restore([holder.pid]))
-        _, back_ms = await _timed(back)
-        if await holder.ask("sum") != numbers:
+        _, back_ms = await _timed(answered_within(CHECKPOINT_S, lambda: action.restore(pids)))
+        if await ask(holder, "sum", bed.part_bytes) != numbers:
             raise Missed("the process continued with other numbers")
     return left / MIB, f"suspended in {gone_ms / 1000:.2f} s, resumed in {back_ms / 1000:.2f} s"
 
@@ -231,7 +236,7 @@ async def kill_holder(bed: Bed) -> Found:
     """Measure the time from a holder's SIGKILL to the grant of its bytes."""
     async with bed.holder("killed", bed.part_bytes) as holder:
         began_s = time.monotonic()
-        await holder.kill()
+        await bed.programs.stop(holder.name, SIGKILL)
         async with bed.client.lease(_all(bed), VERIFY_TIMEOUT_S):
             return (time.monotonic() - began_s) * 1000, "and measured back"
 
@@ -263,11 +268,10 @@ async def _held(bed: Bed) -> str:
 # -- models
 @row("processes", source="limits.md", most=0, skill=POLICY, limit_s=MODEL_S + ROW_S)
 async def fork_server(bed: Bed) -> Found:
-    """Measure the processes of sidecar and daemon with a context, beside the model's."""
+    """Measure the processes of daemon and sidecars with a context, beside the model's."""
     async with bed.model(POLICY):
-        roots = [bed.programs.running[name].process.pid for name in (POLICY, "arbiter")]
         pids = [int(one.name) for one in procfs.PROC.iterdir() if one.name.isdecimal()]
-        tree = [pid for pid in pids if any(is_below(pid, root) for root in roots)]
+        tree = [pid for pid in pids if pid != os.getpid() and is_below(pid, os.getpid())]
         listed = (await bed.read()).processes or {}  # in a container: pids of the host
         holding = [pid for pid in tree if (pid in listed if bed.simulated else _opened_uvm(pid))]
     if not holding:
@@ -282,51 +286,51 @@ def _opened_uvm(pid: int) -> bool:
         return False
 
 
-def _model(skill: str, budget_ms: float) -> Callable[[Measure], Measure]:
-    """Make a row of a function that asks a model; its limit is the manifest's."""
-    return row(
-        "ms", source=f"latency_budget of {skill}", most=budget_ms, limit_s=MODEL_S + ROW_S,
-        skill=skill, timed_model=True,
-    )  # fmt: skip
+type Question = Callable[[Any, RSkillManifest], Awaitable[None]]
+"""Asks the client of a model, and judges its answer. Raises Missed."""
+
+
+def _model(skill: str, budget_ms: float) -> Callable[[Question], Measure]:
+    """Make a row of a question to a model; its limit is the manifest's."""
+    fields = {"source": f"latency_budget of {skill}", "most": budget_ms, "timed_model": True}
+
+    def made(question: Question) -> Measure:
+        @row("ms", **fields, limit_s=MODEL_S + ROW_S, skill=skill)
+        @wraps(question)
+        async def measure(bed: Bed) -> Found:
+            before = await bed.used()
+            async with bed.model(skill) as asked:
+                await question(*asked)  # the first one loads its kernels
+                _, ms = await _timed(question(*asked))
+                return ms, f"resident in {(await bed.used() - before) / MIB:.0f} MiB"
+
+        return measure
+
+    return made
 
 
 @_model(DETECTOR, 1000)
-async def detector(bed: Bed) -> Found:
+async def detector(client: Any, manifest: RSkillManifest) -> None:
     """Measure the time in which a detector finds a drawn cube."""
-    found, told = await _answered(bed, DETECTOR, lambda at, _: at.detect(_cube(), "red cube"))
+    found = await client.detect(_cube(), "red cube")
     if not found or math.dist(found[0].centre, CUBE_PX) > CUBE_SIDE_PX / 2:
         raise Missed(f"expected the cube at {CUBE_PX}, found {found[:1]}")
-    return told
 
 
 @_model(VLM, 3000)
-async def vlm(bed: Bed) -> Found:
+async def vlm(client: Any, manifest: RSkillManifest) -> None:
     """Measure the time in which a scene VLM answers about it."""
-    question = "Has the robot gripper grasped the red cube?"
-    said, told = await _answered(bed, VLM, lambda at, _: at.query(_cube(), question))
+    said = await client.query(_cube(), "Has the robot gripper grasped the red cube?")
     if not said.startswith("No"):
         raise Missed(f"the drawn cube lies on a table, and the answer is {said!r}")
-    return told
 
 
 @_model(POLICY, 400)
-async def policy(bed: Bed) -> Found:
+async def policy(client: Any, manifest: RSkillManifest) -> None:
     """Measure the time in which a policy answers to noise."""
-    actions, told = await _answered(bed, POLICY, ASKED[Kind.VLA])
+    actions = await client.get_action(observation_of(manifest))
     if not all(map(math.isfinite, actions["action"].ravel())):
         raise Missed("its actions are not finite")
-    return told
-
-
-async def _answered(
-    bed: Bed, skill: str, ask: Callable[[Any, RSkillManifest], Awaitable[Any]]
-) -> tuple[Any, Found]:
-    """Return a model's second answer and its time: the first loads its kernels."""
-    before = await bed.used()
-    async with bed.model(skill) as (client, manifest):
-        await ask(client, manifest)
-        answer, ms = await _timed(ask(client, manifest))
-        return answer, (ms, f"resident in {(await bed.used() - before) / MIB:.0f} MiB")
 
 
 def _cube() -> bytes:

@@ -21,14 +21,13 @@ from tests.support.waiting import PATIENCE_S, until
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.selftest.rows import LAST, READINGS, ROWS
 from vram_arbiter.clients.selftest.run import leased_at, room_on
-from vram_arbiter.schemas.errors import ConfigError
 
 pytestmark = pytest.mark.e2e
 PROGRAM = (sys.executable, "-m", "vram_arbiter.clients", "selftest")
 NOT_SIMULATED = {"restore", "page-locked", "nf4", "checkpoint"}
-BEFORE = 3 + READINGS
-"""Readings of one GPU up to the end of the row `reading`: by the choice of the GPU, to open it,
-before all rows, and those of the row."""
+BEFORE = 4 + READINGS
+"""Readings of one GPU up to the end of the row `reading`: by the choice of the GPU, to open it, for
+its room, before all rows, and those of the row."""
 
 
 @pytest.fixture
@@ -168,17 +167,14 @@ def test_a_gpu_that_an_arbiter_leases_is_refused(
 
 
 def test_the_room_is_that_of_one_lease(make_arbiter: Make) -> None:
-    """Of a GPU in MIG mode the daemon leases the instances, under ids of their own."""
     arbiter = make_arbiter().start()
 
-    async def asked(gpu: str = "") -> int:
+    async def asked() -> int:
         async with AsyncClient("test", endpoint=arbiter.endpoint) as client:
             (view,) = (await client.status()).gpus
-            return await room_on(client, gpu or view.gpu)
+            return await room_on(client, view.gpu)
 
     assert asyncio.run(asked()) == 8 * GIB - 300 * MIB - 128 * MIB
-    with pytest.raises(ConfigError, match="not GPU-1: is it split into instances"):
-        asyncio.run(asked("GPU-1"))
 
 
 def test_options_are_checked_first(alone: dict[str, str]) -> None:
