@@ -14,7 +14,7 @@ from random import Random
 from typing import Any, Final, Self
 
 from vram_arbiter.clients.ray import agent, placement
-from vram_arbiter.clients.ray.leased import MARKER, LeasedSpec, hold, refuse_resources
+from vram_arbiter.clients.ray.leased import MARKER, LeasedSpec, hold, refuse_options
 from vram_arbiter.clients.ray.mapping import Result, map_results
 from vram_arbiter.clients.ray.placement import Ranked, View
 from vram_arbiter.clients.ray.residency import Refused
@@ -265,8 +265,7 @@ def _options(cls: Any) -> tuple[LeasedSpec | None, JsonObject]:
     spec: LeasedSpec | None = getattr(made, "leased", None)
     options: JsonObject = {"max_restarts": -1}
     if spec is not None:
-        refuse_resources(name for name in ("num_gpus", "accelerator_type") if given.get(name))
-        refuse_resources(given.get("resources") or {})
+        refuse_options(given)
         # a CPU that it held while it waits for a lease could be what the holder waits for
         options |= {"num_cpus": 0, "resources": {MARKER: SLIVER}}
     return spec, options

@@ -12,8 +12,7 @@ It needs no Ray: a plain object of the class does the same in its own process.
 
 import inspect
 import os
-import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import wraps
 from typing import Any, Final, cast
@@ -31,6 +30,8 @@ MARKER: Final = "vram_arbiter"
 WAIT_S: Final = 30.0
 _RETRIES = "__ray_max_task_retries__"
 """What `ray.method(max_task_retries=…)` puts on a method."""
+_CREATE = "_remote"
+"""What `remote` and `options` of Ray's class or task call, with all options by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,14 +82,17 @@ def idempotent[F: Callable[..., object]](method: F) -> F:
     return method
 
 
-def refuse_resources(names: Iterable[str]) -> None:
-    """Raise BadRequest for GPUs or bytes that Ray counts beside a lease."""
-    for name in names:
+def refuse_options(options: Mapping[str, Any]) -> None:
+    """Raise BadRequest for GPUs or bytes among Ray's options of a leased actor or task."""
+    asked = [name for name in ("num_gpus", "accelerator_type") if options.get(name)]
+    for name in options.get("resources") or ():
         if name != MARKER and any(word in name.casefold() for word in ("gpu", "vram")):
-            raise BadRequest(
-                f"resource {name!r} stands beside @leased: Ray would count what the arbiter leases",
-                hint=f"leave it out; the only resource of a leased actor is {MARKER!r}",
-            )
+            asked.append(name)
+    if asked:
+        raise BadRequest(
+            f"resource {asked[0]!r} stands beside @leased: Ray would count what the arbiter leases",
+            hint=f"leave it out; the only resource of a leased actor is {MARKER!r}",
+        )
 
 
 def hold(actor: Any) -> None:
@@ -98,7 +102,7 @@ def hold(actor: Any) -> None:
 
 
 # -- classes
-def _leased_class[C: type[Any]](made: C, spec: LeasedSpec) -> C:
+def _leased_class(made: Any, spec: LeasedSpec) -> Any:
     methods = {
         name: method
         for name, method in inspect.getmembers_static(made, inspect.isfunction)
@@ -113,15 +117,22 @@ def _leased_class[C: type[Any]](made: C, spec: LeasedSpec) -> C:
         del methods[name]
     for name, method in methods.items():
         setattr(made, name, _inside_a_use(made, method))
-    begin: Any = made.__init__
+    begin = made.__init__
 
     def init(self: Any, *arguments: Any, **named: Any) -> None:
-        _refuse_assigned()
         self._residency = Residency(self, spec.lease, spec.wait_s)
         begin(self, *arguments, **named)
 
+    own = vars(made).get("__init_subclass__")
+
+    def init_subclass(cls: type[Any], /, **named: Any) -> None:
+        (own.__get__(None, cls) if own else super(made, cls).__init_subclass__)(**named)
+        if hasattr(cls, _CREATE):  # Ray's, which takes the options
+            _guard(cls)
+
     # Ray signs the innermost function, and object's is none
     made.__init__ = wraps(begin)(init) if inspect.isfunction(begin) else init
+    made.__init_subclass__ = classmethod(init_subclass)
     made.leased = spec
     return made
 
@@ -156,13 +167,17 @@ def _inside_a_use(made: type, method: Any) -> Any:
     return call
 
 
-def _refuse_assigned() -> None:
-    """Refuse what Ray assigned to this actor, wherever its options were given."""
-    ray: Any = sys.modules.get("ray")
-    if ray is not None and ray.is_initialized():
-        context = ray.get_runtime_context()
-        if context.get_actor_id() is not None:
-            refuse_resources(context.get_assigned_resources())
+def _guard(remote: Any) -> None:
+    """Let Ray's class or task refuse options of `remote(…)` and `options(…).remote(…)`: Ray would
+    wait for a node that has such GPUs, for ever."""
+    create = getattr(remote, _CREATE)
+
+    @wraps(create)
+    def guarded(*arguments: Any, **options: Any) -> Any:
+        refuse_options(options)
+        return create(*arguments, **options)
+
+    setattr(remote, _CREATE, guarded)
 
 
 # -- tasks
@@ -184,7 +199,7 @@ def _leased_task(made: Any, spec: LeasedSpec) -> Any:
             "context without a lease",
             hint="write @leased(…) above @ray.remote(max_calls=1)",
         )
-    refuse_resources(["num_gpus"] if options.get("num_gpus") else options.get("resources") or ())
+    refuse_options(options)
     import ray
 
     function = made._function
@@ -196,4 +211,6 @@ def _leased_task(made: Any, spec: LeasedSpec) -> Any:
             os.environ.update(visible(job.lease.gpu, os.environ))
             return function(*arguments, **named)
 
-    return ray.remote(**options)(call)
+    task = ray.remote(**options)(call)
+    _guard(task)
+    return task
