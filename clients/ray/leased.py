@@ -12,26 +12,22 @@ It needs no Ray: a plain object of the class does the same in its own process.
 
 import inspect
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
 from typing import Any, Final, cast
 
 from vram_arbiter.clients._spec import Vram, lease_spec
 from vram_arbiter.clients.cuda import visible
+from vram_arbiter.clients.ray.refusals import CREATE, guard, refuse_options
 from vram_arbiter.clients.ray.residency import Residency
 from vram_arbiter.clients.sync import Lease
 from vram_arbiter.schemas.errors import BadRequest
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
-MARKER: Final = "vram_arbiter"
-"""The only resource of ours that Ray counts: which nodes have an arbiter."""
-
 WAIT_S: Final = 30.0
 _RETRIES = "__ray_max_task_retries__"
 """What `ray.method(max_task_retries=…)` puts on a method."""
-_CREATE = "_remote"
-"""What `remote` and `options` of Ray's class or task call, with all options by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,19 +78,6 @@ def idempotent[F: Callable[..., object]](method: F) -> F:
     return method
 
 
-def refuse_options(options: Mapping[str, Any]) -> None:
-    """Raise BadRequest for GPUs or bytes among Ray's options of a leased actor or task."""
-    asked = [name for name in ("num_gpus", "accelerator_type") if options.get(name)]
-    for name in options.get("resources") or ():
-        if name != MARKER and any(word in name.casefold() for word in ("gpu", "vram")):
-            asked.append(name)
-    if asked:
-        raise BadRequest(
-            f"resource {asked[0]!r} stands beside @leased: Ray would count what the arbiter leases",
-            hint=f"leave it out; the only resource of a leased actor is {MARKER!r}",
-        )
-
-
 def hold(actor: Any) -> None:
     """Load a leased actor's model now: `actor.__ray_call__.remote(hold)`. Raises Refused."""
     with actor._residency.call("hold"):
@@ -127,8 +110,8 @@ def _leased_class(made: Any, spec: LeasedSpec) -> Any:
 
     def init_subclass(cls: type[Any], /, **named: Any) -> None:
         (own.__get__(None, cls) if own else super(made, cls).__init_subclass__)(**named)
-        if hasattr(cls, _CREATE):  # Ray's, which takes the options
-            _guard(cls)
+        if hasattr(cls, CREATE):  # Ray's, which takes the options
+            guard(cls)
 
     # Ray signs the innermost function, and object's is none
     made.__init__ = wraps(begin)(init) if inspect.isfunction(begin) else init
@@ -167,19 +150,6 @@ def _inside_a_use(made: type, method: Any) -> Any:
     return call
 
 
-def _guard(remote: Any) -> None:
-    """Let Ray's class or task refuse options of `remote(…)` and `options(…).remote(…)`: Ray would
-    wait for a node that has such GPUs, for ever."""
-    create = getattr(remote, _CREATE)
-
-    @wraps(create)
-    def guarded(*arguments: Any, **options: Any) -> Any:
-        refuse_options(options)
-        return create(*arguments, **options)
-
-    setattr(remote, _CREATE, guarded)
-
-
 # -- tasks
 class _Job:
     """Owner of a task's lease; the task loads for itself."""
@@ -212,5 +182,5 @@ def _leased_task(made: Any, spec: LeasedSpec) -> Any:
             return function(*arguments, **named)
 
     task = ray.remote(**options)(call)
-    _guard(task)
+    guard(task)
     return task

@@ -15,7 +15,7 @@ from tests.support.leases import Spec
 from tests.support.process import ArbiterProcess
 from tests.support.waiting import PATIENCE_S, play, until
 from vram_arbiter.clients.ray import Refused, idempotent, leased
-from vram_arbiter.clients.ray.leased import refuse_options
+from vram_arbiter.clients.ray.refusals import refuse_options
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.errors import BadRequest, LeaseRevoking, WaitTimeout
