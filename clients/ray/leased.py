@@ -63,6 +63,11 @@ def leased[T](
 
     def decorate(made: T) -> T:
         decorated: Any = made
+        if metadata := getattr(made, "__ray_metadata__", None):
+            raise BadRequest(
+                f"{metadata.class_name} is an actor of Ray already",
+                hint="write @ray.remote above @leased(…)",
+            )
         name = getattr(decorated, "__name__", None) or decorated._function_name.rpartition(".")[2]
         given = {} if priority is None else {"priority": priority}
         spec = LeasedSpec(lease_spec(None, name, vram, model, given), wait_s)

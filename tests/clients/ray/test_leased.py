@@ -252,6 +252,14 @@ def test_gpus_and_bytes_in_options_are_refused_before_ray_waits_for_them() -> No
             ray.cloudpickle.loads(ray.cloudpickle.dumps(sent)).options(num_gpus=1).remote()
 
 
+@pytest.mark.heavy
+def test_a_class_that_is_an_actor_already_is_refused() -> None:
+    """It was an AttributeError; tasks are leased in that order."""
+    ray: Any = pytest.importorskip("ray")
+    with pytest.raises(BadRequest, match="Model is an actor of Ray already"):
+        leased(vram="5GiB", model="m")(ray.remote(Model))
+
+
 def test_a_leased_class_keeps_what_its_subclasses_go_through() -> None:
     class Named(Model):
         names: ClassVar[list[str]] = []
