@@ -3,7 +3,6 @@ by it. Ray runs and restarts actors; each box's arbiter decides what its GPU hol
 """
 
 import contextlib
-import ipaddress
 import logging
 import socket
 import time
@@ -14,11 +13,18 @@ from random import Random
 from typing import Any, Final, Self
 
 from vram_arbiter.clients.ray import agent, placement
-from vram_arbiter.clients.ray.leased import MARKER, LeasedSpec, hold, refuse_resources
+from vram_arbiter.clients.ray.leased import LeasedSpec, hold
 from vram_arbiter.clients.ray.mapping import Result, map_results
 from vram_arbiter.clients.ray.placement import Ranked, View
+from vram_arbiter.clients.ray.refusals import (
+    MARKER,
+    refuse_bytes,
+    refuse_open,
+    refuse_options,
+    token_auth,
+)
 from vram_arbiter.clients.ray.residency import Refused
-from vram_arbiter.schemas.errors import ArbiterUnreachable, BadRequest, ConfigError, NotPermitted
+from vram_arbiter.schemas.errors import ArbiterUnreachable, BadRequest, ConfigError
 from vram_arbiter.schemas.plain import JsonMap, JsonObject, Message
 from vram_arbiter.schemas.runtime.extras import need
 
@@ -60,8 +66,8 @@ class Fleet:
 
         if not ray.is_initialized():
             raise ConfigError("no connection to Ray", hint='call ray.init(address="auto") first')
-        nodes = [node for node in ray.nodes() if node["Alive"]]
-        refuse_open([node["NodeManagerAddress"] for node in nodes], token=_token_auth())
+        nodes = _alive()
+        refuse_open([node["NodeManagerAddress"] for node in nodes], token=token_auth())
         for node in nodes:
             refuse_bytes(node["NodeManagerHostname"], node["Resources"])
         boxes = self.boxes()
@@ -78,12 +84,10 @@ class Fleet:
 
     def boxes(self) -> dict[str, str]:
         """Return the name of each box by its node id: the label `box`, else the host's name."""
-        import ray
-
         return {
             node["NodeID"]: node["Labels"].get("box") or node["NodeManagerHostname"]
-            for node in ray.nodes()
-            if node["Alive"] and node["Resources"].get(MARKER)
+            for node in _alive()
+            if node["Resources"].get(MARKER)
         }
 
     # -- what arbiters say
@@ -133,7 +137,7 @@ class Fleet:
                 raise _no_box(spec, {one.node: one.reason for one in ranked})
         return [
             _start(cls, options, node, args, named)
-            for node in (_alive() if nodes is None else nodes)
+            for node in ([one["NodeID"] for one in _alive()] if nodes is None else nodes)
             for _ in range(per_node)
         ]
 
@@ -227,35 +231,6 @@ def connected(address: str) -> Iterator[Fleet]:
         ray.shutdown()
 
 
-# -- refusals
-def refuse_open(addresses: Iterable[str], *, token: bool) -> None:
-    """Raise NotPermitted for nodes that other machines reach without a token: Ray runs the code of
-    everyone who connects."""
-    for address in addresses:
-        if not token and not ipaddress.ip_address(address).is_loopback:
-            raise NotPermitted(
-                f"this Ray cluster listens at {address} without authentication",
-                hint="set RAY_AUTH_MODE=token and a token on all its nodes",
-            )
-
-
-def refuse_bytes(box: str, resources: Iterable[str]) -> None:
-    """Raise BadRequest for a node that announces bytes of GPUs to Ray, which cannot evict."""
-    for name in resources:
-        said = name.casefold()
-        if name != MARKER and ("vram" in said or ("gpu" in said and "mem" in said)):
-            raise BadRequest(
-                f"node {box} announces {name!r}: Ray would count bytes that its arbiter leases",
-                hint=f"start it with the resource {MARKER!r} alone",
-            )
-
-
-def _token_auth() -> bool:
-    from ray._private.authentication.authentication_utils import is_token_auth_enabled
-
-    return bool(is_token_auth_enabled())
-
-
 # -- Ray
 def _options(cls: Any) -> tuple[LeasedSpec | None, JsonObject]:
     """Return what a class leases, and the options of its actors. Raises BadRequest for resources
@@ -265,8 +240,7 @@ def _options(cls: Any) -> tuple[LeasedSpec | None, JsonObject]:
     spec: LeasedSpec | None = getattr(made, "leased", None)
     options: JsonObject = {"max_restarts": -1}
     if spec is not None:
-        refuse_resources(name for name in ("num_gpus", "accelerator_type") if given.get(name))
-        refuse_resources(given.get("resources") or {})
+        refuse_options(given)
         # a CPU that it held while it waits for a lease could be what the holder waits for
         options |= {"num_cpus": 0, "resources": {MARKER: SLIVER}}
     return spec, options
@@ -281,10 +255,11 @@ def _start(cls: Any, options: JsonObject, node: str, args: Sequence[Any], named:
     return remote.options(scheduling_strategy=on, **options).remote(*args, **named)
 
 
-def _alive() -> list[str]:
+def _alive() -> list[JsonObject]:
+    """Return what Ray says of its nodes that are alive."""
     import ray
 
-    return [node["NodeID"] for node in ray.nodes() if node["Alive"]]
+    return [node for node in ray.nodes() if node["Alive"]]
 
 
 def _refused(actor: Any, within_s: float) -> str | None:

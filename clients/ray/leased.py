@@ -12,21 +12,18 @@ It needs no Ray: a plain object of the class does the same in its own process.
 
 import inspect
 import os
-import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
 from typing import Any, Final, cast
 
 from vram_arbiter.clients._spec import Vram, lease_spec
 from vram_arbiter.clients.cuda import visible
+from vram_arbiter.clients.ray.refusals import CREATE, guard, refuse_options
 from vram_arbiter.clients.ray.residency import Residency
 from vram_arbiter.clients.sync import Lease
 from vram_arbiter.schemas.errors import BadRequest
 from vram_arbiter.schemas.wire.spec import LeaseSpec
-
-MARKER: Final = "vram_arbiter"
-"""The only resource of ours that Ray counts: which nodes have an arbiter."""
 
 WAIT_S: Final = 30.0
 _RETRIES = "__ray_max_task_retries__"
@@ -66,6 +63,11 @@ def leased[T](
 
     def decorate(made: T) -> T:
         decorated: Any = made
+        if metadata := getattr(made, "__ray_metadata__", None):
+            raise BadRequest(
+                f"{metadata.class_name} is an actor of Ray already",
+                hint="write @ray.remote above @leased(…)",
+            )
         name = getattr(decorated, "__name__", None) or decorated._function_name.rpartition(".")[2]
         given = {} if priority is None else {"priority": priority}
         spec = LeasedSpec(lease_spec(None, name, vram, model, given), wait_s)
@@ -81,16 +83,6 @@ def idempotent[F: Callable[..., object]](method: F) -> F:
     return method
 
 
-def refuse_resources(names: Iterable[str]) -> None:
-    """Raise BadRequest for GPUs or bytes that Ray counts beside a lease."""
-    for name in names:
-        if name != MARKER and any(word in name.casefold() for word in ("gpu", "vram")):
-            raise BadRequest(
-                f"resource {name!r} stands beside @leased: Ray would count what the arbiter leases",
-                hint=f"leave it out; the only resource of a leased actor is {MARKER!r}",
-            )
-
-
 def hold(actor: Any) -> None:
     """Load a leased actor's model now: `actor.__ray_call__.remote(hold)`. Raises Refused."""
     with actor._residency.call("hold"):
@@ -98,7 +90,7 @@ def hold(actor: Any) -> None:
 
 
 # -- classes
-def _leased_class[C: type[Any]](made: C, spec: LeasedSpec) -> C:
+def _leased_class(made: Any, spec: LeasedSpec) -> Any:
     methods = {
         name: method
         for name, method in inspect.getmembers_static(made, inspect.isfunction)
@@ -113,15 +105,22 @@ def _leased_class[C: type[Any]](made: C, spec: LeasedSpec) -> C:
         del methods[name]
     for name, method in methods.items():
         setattr(made, name, _inside_a_use(made, method))
-    begin: Any = made.__init__
+    begin = made.__init__
 
     def init(self: Any, *arguments: Any, **named: Any) -> None:
-        _refuse_assigned()
         self._residency = Residency(self, spec.lease, spec.wait_s)
         begin(self, *arguments, **named)
 
+    own = vars(made).get("__init_subclass__")
+
+    def init_subclass(cls: type[Any], /, **named: Any) -> None:
+        (own.__get__(None, cls) if own else super(made, cls).__init_subclass__)(**named)
+        if hasattr(cls, CREATE):  # Ray's, which takes the options
+            guard(cls)
+
     # Ray signs the innermost function, and object's is none
     made.__init__ = wraps(begin)(init) if inspect.isfunction(begin) else init
+    made.__init_subclass__ = classmethod(init_subclass)
     made.leased = spec
     return made
 
@@ -156,15 +155,6 @@ def _inside_a_use(made: type, method: Any) -> Any:
     return call
 
 
-def _refuse_assigned() -> None:
-    """Refuse what Ray assigned to this actor, wherever its options were given."""
-    ray: Any = sys.modules.get("ray")
-    if ray is not None and ray.is_initialized():
-        context = ray.get_runtime_context()
-        if context.get_actor_id() is not None:
-            refuse_resources(context.get_assigned_resources())
-
-
 # -- tasks
 class _Job:
     """Owner of a task's lease; the task loads for itself."""
@@ -184,7 +174,7 @@ def _leased_task(made: Any, spec: LeasedSpec) -> Any:
             "context without a lease",
             hint="write @leased(…) above @ray.remote(max_calls=1)",
         )
-    refuse_resources(["num_gpus"] if options.get("num_gpus") else options.get("resources") or ())
+    refuse_options(options)
     import ray
 
     function = made._function
@@ -196,4 +186,6 @@ def _leased_task(made: Any, spec: LeasedSpec) -> Any:
             os.environ.update(visible(job.lease.gpu, os.environ))
             return function(*arguments, **named)
 
-    return ray.remote(**options)(call)
+    task = ray.remote(**options)(call)
+    guard(task)
+    return task

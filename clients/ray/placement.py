@@ -61,10 +61,6 @@ class View:
     waiting: int
     at: float = 0.0
 
-    @property
-    def evictable_bytes(self) -> int:
-        return sum(room.evictable_bytes for room in self.gpus)
-
 
 @dataclass(frozen=True, slots=True)
 class Ranked:
@@ -77,7 +73,6 @@ class Ranked:
     free_bytes: int | None = None
     evictable_bytes: int | None = None
     budget_bytes: int | None = None
-    age_s: float | None = None
 
     @property
     def usable(self) -> bool:
@@ -131,20 +126,19 @@ def rank(
 
 def _placed(node: str, view: View | None, need_bytes: int, model: str, now: float) -> Ranked:
     """Judge one node by the GPU that suits best."""
-    if view is None:
-        return Ranked(node, "", Reason.UNKNOWN)
-    age_s, budget = now - view.at, max((room.budget_bytes for room in view.gpus), default=0)
-    told = partial(Ranked, node, view.box, age_s=age_s)
+    if view is None or now - view.at > STALE_S:
+        return Ranked(node, view.box if view else "", Reason.UNKNOWN)
+    told = partial(Ranked, node, view.box)
+    budget = max((room.budget_bytes for room in view.gpus), default=0)
+    if need_bytes > budget:
+        return told(Reason.TOO_SMALL, budget_bytes=budget)
     known = [
         (room.free_bytes, room.evictable_bytes, room.budget_bytes)
         for room in view.gpus
         if room.free_bytes is not None and room.budget_bytes >= need_bytes
     ]
-    if age_s > STALE_S:
-        return told(Reason.UNKNOWN)
-    if need_bytes > budget or not known:
-        small = need_bytes > budget
-        return told(Reason.TOO_SMALL if small else Reason.UNKNOWN, budget_bytes=budget)
+    if not known:
+        return told(Reason.UNKNOWN, budget_bytes=budget)
     free, evictable, budget = max(known, key=lambda gpu: (gpu[0] >= need_bytes, gpu[0] + gpu[1]))
     if free >= need_bytes:
         reason = _WARM.get(view.resident.get(model, ""), Reason.FREE)

@@ -19,7 +19,8 @@ from tests.support.episodes import Player
 from tests.support.waiting import PATIENCE_S, until
 from vram_arbiter.clients.ray import Fleet, Reason, View, leased
 from vram_arbiter.clients.ray import agent as agents
-from vram_arbiter.clients.ray.fleet import _options, connected, refuse_bytes, refuse_open
+from vram_arbiter.clients.ray.fleet import _options, connected
+from vram_arbiter.clients.ray.refusals import refuse_bytes, refuse_open
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.errors import (

@@ -6,7 +6,7 @@ import inspect
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -15,7 +15,7 @@ from tests.support.leases import Spec
 from tests.support.process import ArbiterProcess
 from tests.support.waiting import PATIENCE_S, play, until
 from vram_arbiter.clients.ray import Refused, idempotent, leased
-from vram_arbiter.clients.ray.leased import refuse_resources
+from vram_arbiter.clients.ray.refusals import refuse_options
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.errors import BadRequest, LeaseRevoking, WaitTimeout
@@ -228,6 +228,51 @@ def test_a_task_runs_inside_a_lease_of_its_own(
             leased(vram="5GiB", model="job")(ray.remote(**options)(job))
 
 
+@pytest.mark.heavy
+def test_gpus_and_bytes_in_options_are_refused_before_ray_waits_for_them() -> None:
+    """Ray waited for ever for a node with a GPU; none announces one to it."""
+    ray: Any = pytest.importorskip("ray")
+
+    def job() -> None: ...
+
+    class Policy(Model): ...
+
+    lease = leased(vram="5GiB", model="m")
+    policy, task = lease(Policy), lease(ray.remote(max_calls=1)(job))
+    for beside in ({"num_gpus": 1}, {"accelerator_type": "A100"}, {"resources": {"vram": 1}}):
+        for asked in (
+            ray.remote(policy).options(**beside),
+            ray.remote(**beside)(policy),
+            task.options(**beside),
+        ):
+            with pytest.raises(BadRequest, match="beside @leased"):
+                asked.remote()
+    for sent in (ray.remote(policy), task):  # a class of __main__ goes by value
+        with pytest.raises(BadRequest, match="beside @leased"):
+            ray.cloudpickle.loads(ray.cloudpickle.dumps(sent)).options(num_gpus=1).remote()
+
+
+@pytest.mark.heavy
+def test_a_class_that_is_an_actor_already_is_refused() -> None:
+    """It was an AttributeError; tasks are leased in that order."""
+    ray: Any = pytest.importorskip("ray")
+    with pytest.raises(BadRequest, match="Model is an actor of Ray already"):
+        leased(vram="5GiB", model="m")(ray.remote(Model))
+
+
+def test_a_leased_class_keeps_what_its_subclasses_go_through() -> None:
+    class Named(Model):
+        names: ClassVar[list[str]] = []
+
+        def __init_subclass__(cls, **named: Any) -> None:
+            super().__init_subclass__(**named)
+            cls.names.append(cls.__name__)
+
+    class Sub(leased(vram="5GiB", model="m")(Named)): ...  # type: ignore[misc]
+
+    assert Named.names == ["Sub"]
+
+
 def test_what_cannot_be_leased_is_refused_by_name() -> None:
     class Bare:
         def act(self) -> None: ...
@@ -254,10 +299,10 @@ def test_what_cannot_be_leased_is_refused_by_name() -> None:
 
 
 def test_bytes_and_gpus_beside_a_lease_are_refused_by_name() -> None:
-    refuse_resources({"CPU": 1.0, "vram_arbiter": 0.001})
-    for name in ("num_gpus", "GPU", "vram_bytes"):
+    refuse_options({"num_cpus": 1, "num_gpus": 0, "resources": {"disk": 1, "vram_arbiter": 0.001}})
+    for name in ("gpu_memory", "vram_bytes"):
         with pytest.raises(BadRequest, match=name):
-            refuse_resources([name])
+            refuse_options({"resources": {name: 1}})
 
 
 def test_methods_are_functions_to_their_core() -> None:

@@ -123,7 +123,7 @@ def test_a_status_says_what_a_placement_needs(make_arbiter: Make) -> None:
         assert loading.resident == {MODEL: "loading"}
         lease.ready(2 * GIB)
         with lease.use():
-            assert view_of(arbiter.status(), "box").evictable_bytes == 0
+            assert view_of(arbiter.status(), "box").gpus[0].evictable_bytes == 0
         idle = view_of(arbiter.status(), "box")
         assert (idle.resident, idle.waiting) == ({MODEL: "held"}, 0)
         assert idle.gpus == (Room(budget - 2 * GIB, budget, 2 * GIB),)
