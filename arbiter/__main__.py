@@ -8,8 +8,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from vram_arbiter.schemas.config.arbiter import ArbiterConfig, load_config
 from vram_arbiter.schemas.errors import (
     AlreadyRunning,
     ConfigError,
@@ -20,9 +20,12 @@ from vram_arbiter.schemas.errors import (
     VramError,
 )
 from vram_arbiter.schemas.runtime import terminal
+from vram_arbiter.schemas.runtime.heap import give_back_freed_memory, without_collections
 from vram_arbiter.schemas.runtime.version import add_version, version
 from vram_arbiter.schemas.urls import http_address
-from vram_arbiter.schemas.yamltext import read_text
+
+if TYPE_CHECKING:
+    from vram_arbiter.schemas.config.arbiter import ArbiterConfig
 
 EXIT_USAGE, EXIT_ALREADY_RUNNING, EXIT_NO_GPU, EXIT_NO_DISK, EXIT_DEFECT = 2, 3, 4, 5, 70
 CONFIG_NAME = "arbiter.yaml"
@@ -125,10 +128,14 @@ def config_of_service(environ: Mapping[str, str]) -> Path | None:
     return found if folder and found.exists() else None
 
 
-def effective_config(flags: argparse.Namespace, file: Path | None) -> ArbiterConfig:
+def effective_config(flags: argparse.Namespace, file: Path | None) -> "ArbiterConfig":
     """Return the file's configuration with the flags over it. Raises ConfigError."""
+    from vram_arbiter.schemas.config.arbiter import ArbiterConfig, load_config
+
     config = ArbiterConfig()
     if file is not None:
+        from vram_arbiter.schemas.yamltext import read_text
+
         text = read_text(file, hint="--config needs a readable YAML file", trusted=True)
         config = load_config(text, str(file))
     values = config.model_dump()
@@ -184,14 +191,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     faulthandler.enable()
     try:
         file = flags.config or config_of_service(os.environ)
-        config = effective_config(flags, file)
-        # late: --help and --version need none of it
-        from vram_arbiter.arbiter.daemon import Daemon
-        from vram_arbiter.arbiter.host.process import new_loop
-        from vram_arbiter.arbiter.log import set_up_logging, write_in_thread
-        from vram_arbiter.arbiter.places import find_places
-        from vram_arbiter.arbiter.reload import Source
-        from vram_arbiter.schemas.runtime.heap import give_back_freed_memory
+        with without_collections():  # modules stay
+            config = effective_config(flags, file)
+            # late: --help and --version need none of it
+            from vram_arbiter.arbiter.daemon import Daemon
+            from vram_arbiter.arbiter.host.process import new_loop
+            from vram_arbiter.arbiter.log import set_up_logging, write_in_thread
+            from vram_arbiter.arbiter.places import find_places
+            from vram_arbiter.arbiter.reload import Source
 
         places = find_places(config, os.environ, os.getuid())
         if flags.check_config:

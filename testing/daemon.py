@@ -116,15 +116,12 @@ class ArbiterProcess:
             self.messages.append(self._notify.recv(4096).decode())
         return bool(there)
 
-    def stop(self) -> int:
-        """SIGTERM, and its exit code."""
-        return self._end(signal.SIGTERM)
-
     def kill(self) -> int:
         """SIGKILL."""
-        return self._end(signal.SIGKILL)
+        return self.stop(signal.SIGKILL)
 
-    def _end(self, number: signal.Signals) -> int:
+    def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
+        """Send it a signal, and return its exit code."""
         assert self.process is not None
         while self._hear():  # the kernel keeps no more than ten, and drops the rest
             pass

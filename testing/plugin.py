@@ -6,7 +6,7 @@ Pytest imports it at each start, so it imports nothing else of the kit before a 
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -23,12 +23,15 @@ _SHOWN = pytest.StashKey[list[tuple[str, Callable[[], str]]]]()
 """Sections of the report of a failed test: title, and what makes its text."""
 
 
-class GpuBudget(NamedTuple):
-    """Arguments of the marker."""
+def gpu_budget(
+    size: str = "8GiB", lag: str = "500ms", config: str | None = None
+) -> tuple[int, float, str | None]:
+    """Return the marker's arguments as bytes, seconds and text. Raises ValueError, and TypeError
+    for others."""
+    from vram_arbiter.schemas.sizes import parse_bytes
+    from vram_arbiter.testing.gpu import parse_lag
 
-    size: str = "8GiB"
-    lag: str = "500ms"
-    config: str | None = None
+    return parse_bytes(size), parse_lag(lag), config
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -88,17 +91,14 @@ def make_arbiter(request: pytest.FixtureRequest, arbiter_process: Make) -> Itera
 @pytest.fixture
 def arbiter(request: pytest.FixtureRequest, make_arbiter: Make) -> "ArbiterProcess":
     """A running daemon with the simulated GPU of marker `gpu_budget`."""
-    from vram_arbiter.schemas.sizes import parse_bytes
-    from vram_arbiter.testing.gpu import FakeGpu, parse_lag
+    from vram_arbiter.testing.gpu import FakeGpu
 
     mark = request.node.get_closest_marker(MARKER)
     try:
-        budget = GpuBudget(*mark.args, **mark.kwargs) if mark else GpuBudget()
-        size = parse_bytes(budget.size)
-        lag_s = parse_lag(budget.lag)
+        size, lag_s, config = gpu_budget(*mark.args, **mark.kwargs) if mark else gpu_budget()
     except (TypeError, ValueError) as error:
         pytest.fail(f"@pytest.mark.{MARKER}: {error}", pytrace=False)
-    daemon = make_arbiter(f"fake:{size}", config=budget.config).start()
+    daemon = make_arbiter(f"fake:{size}", config=config).start()
     FakeGpu(daemon.gpu_folder).edit(release_lag_s=lag_s)
     return daemon
 

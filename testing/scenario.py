@@ -162,23 +162,15 @@ class _Player:
 
     def tell(self, name: str, word: str, uses: int) -> None:
         """Tell a consumer to begin or end its use, and wait until it has `uses`."""
-
-        def heard() -> bool:
-            lease = self.consumers[name].lease
-            return (lease.uses if lease else 0) == uses
-
-        self.consumers[name].tell(word)
-        eventually(heard, self.scenario.within_s)
+        consumer = self.consumers[name]
+        consumer.tell(word)
+        eventually(lambda: getattr(consumer.lease, "uses", 0) == uses, self.scenario.within_s)
 
     def stowaway(self, size: int) -> None:
         """Put bytes there, and wait until the daemon knows: a reading from before would grant."""
         self.undo.enter_context(self.gpu.stowaway(size))
-
-        def known() -> bool:
-            (gpu,) = all_pages(self._arbiter.endpoint)["gpus"]
-            return bool(gpu["stowaway_bytes"] >= size)
-
-        eventually(known)
+        endpoint = self._arbiter.endpoint
+        eventually(lambda: all_pages(endpoint)["gpus"][0]["stowaway_bytes"] >= size)
 
     def expect(self, states: Mapping[str, str]) -> None:
         for name, state in states.items():

@@ -8,6 +8,7 @@ import contextlib
 import json
 import time
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from operator import itemgetter
 from typing import Final
 
@@ -47,9 +48,8 @@ class Timeline:
             lines.append((0.0, f"no history: {error}"))
         for where, one in self._log_lines():
             size, used = format_bytes(one["bytes"]), format_bytes(one["used_after"])
-            told = (
-                f"{where}  {one['op']} {size} by {one['name']} ({one['pid']}), then {used} in use"
-            )
+            by = f"{one['name']} ({one['pid']})"
+            told = f"{where}  {one['op']} {size} by {by}, then {used} in use"
             lines.append((one["t"] + wall_minus_monotonic_s, told))
         return "\n".join(line for _, line in sorted(lines, key=itemgetter(0)))
 
@@ -78,15 +78,12 @@ class Timeline:
         does not count."""
         __tracebackhide__ = True
         events = self.events("revoke_asked", "revoke_withdrawn", *ENDS, consumer=consumer)
-        revoked: set[str] = set()
-        evictions = 0
-        for one in events:
-            lease = one["lease_id"]
-            if one["kind"] == "revoke_asked":
-                revoked.add(lease)
-            elif lease in revoked:
-                revoked.remove(lease)
-                evictions += one["kind"] in ENDS
+        by_lease = sorted(events, key=itemgetter("lease_id"))  # each one's stay in their order
+        evictions = sum(
+            one["lease_id"] == after["lease_id"]
+            and (one["kind"], after["kind"] in ENDS) == ("revoke_asked", True)
+            for one, after in pairwise(by_lease)
+        )
         if evictions != 1:
             raise _disproved(f"{consumer} was evicted {evictions} times, not once", events)
 

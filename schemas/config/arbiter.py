@@ -13,7 +13,6 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.runtime.endpoints import check_endpoint
 from vram_arbiter.schemas.units import ByteSize, parse_bytes
-from vram_arbiter.schemas.yamltext import parse_yaml, validated, without_empty
 
 Seconds = Annotated[float, Field(gt=0, le=86_400)]
 Share = Annotated[float, Field(gt=0, le=1)]
@@ -21,7 +20,11 @@ Share = Annotated[float, Field(gt=0, le=1)]
 
 class _Section(BaseModel):
     model_config = ConfigDict(
-        frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False
+        frozen=True,
+        extra="forbid",
+        use_attribute_docstrings=True,
+        allow_inf_nan=False,
+        defer_build=True,  # sections are validated as parts of the whole
     )
 
 
@@ -266,4 +269,7 @@ def load_config(text: str, name: str) -> ArbiterConfig:
     Raises ConfigError with every mistake, each with its line: `arbiter.yaml:12: verify.tiemout_s:
     unknown key; did you mean timeout_s?`
     """
+    # late: without a file nothing of YAML is needed
+    from vram_arbiter.schemas.yamltext import parse_yaml, validated, without_empty
+
     return validated(ArbiterConfig, without_empty(ArbiterConfig, parse_yaml(text, name)))

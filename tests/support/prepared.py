@@ -69,7 +69,7 @@ PROGRAMS: Mapping[str, Program] = {
             "vram_arbiter.arbiter.daemon",
             "vram_arbiter.arbiter.host.process",
             "vram_arbiter.arbiter.log",
-            "vram_arbiter.schemas.runtime.heap",
+            "vram_arbiter.schemas.yamltext",
         ),
     ),
     "vramctl": Program(

@@ -95,7 +95,7 @@ def test_reports_and_leftovers(tmp_path: Path) -> None:
     assert "2 failed, 1 passed, 3 errors" in said, said + done.stderr
     for problem in (
         "@pytest.mark.gpu_budget: not a size: '8 bananas'; write bytes or 8GiB",
-        "@pytest.mark.gpu_budget: GpuBudget.__new__() got an unexpected keyword argument 'delay'",
+        "@pytest.mark.gpu_budget: gpu_budget() got an unexpected keyword argument 'delay'",
         "@pytest.mark.gpu_budget: expected a time such as 500ms or 1.5s, got 'soon'",
         "AssertionError: detector was evicted 0 times, not once",
         "- timeline of the arbiter -",
