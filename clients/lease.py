@@ -8,20 +8,27 @@ import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from contextvars import ContextVar
-from typing import Literal
+from typing import Final, Literal
+
+import anyio.lowlevel
 
 from vram_arbiter.clients import use_context
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients._protocol.records import Eviction, LeaseRecord
 from vram_arbiter.clients.eviction import Departure, Driver
 from vram_arbiter.clients.handlers import Handlers, call
-from vram_arbiter.schemas.errors import BadState, LeaseLost, LeaseRevoking, VramError
+from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
+from vram_arbiter.schemas.errors import BadRequest, BadState, LeaseLost, LeaseRevoking, VramError
 from vram_arbiter.schemas.ids import Token, UseId
 from vram_arbiter.schemas.wire.pushes import RevokePush
 from vram_arbiter.schemas.wire.requests import Oom, RevokeAck, UseBegin, UseEnd
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 log = logging.getLogger(__name__)
+
+PAUSE_S: Final = 0.02
+"""A use so long after the one before begins ahead of the arbiter's answer. Uses in a row wait for
+it, so that they are never told faster than the arbiter hears."""
 
 LeaseState = Literal["loading", "held", "revoking", "unloading", "standby", "parked", "gone"]
 
@@ -48,6 +55,7 @@ class AsyncLease:
         self._handlers = handlers
         self._departure = Departure(driver, record, spec, handlers.unload, handlers.park)
         self._restoring = False
+        self._ahead_from = 0.0  # when a use may begin ahead of the arbiter's answer
 
     # -- what it is --------------------------------------------------------------------------------
     @property
@@ -127,14 +135,19 @@ class AsyncLease:
     async def use(self, label: str = "") -> AsyncIterator["AsyncUse"]:
         """Mark a busy interval: the holder is not evicted inside it.
 
-        The first use marks the lease ready, if `ready` was not called. A lease can be *lost* within
-        a use (expired, fenced): check `state` in a long one.
+        The first use marks the lease ready, if `ready` was not called. A use after a pause does not
+        wait for the arbiter: a `revoke` that is on its way waits for its end. A lease can be *lost*
+        within a use (expired, fenced): check `state` in a long one.
 
         Raises: LeaseRevoking or LeaseLost before the block begins.
         """
         use = AsyncUse(self, label)
+        await anyio.lowlevel.checkpoint()  # uses without an `await` must not hide a `revoke`
         try:
-            await use._begin()
+            if use._begin_ahead():
+                use._tell()
+            else:
+                await use._begin()
             use_context.enter(use.use_id, use.name)
             yield use
         finally:
@@ -323,6 +336,11 @@ class AsyncUse:
     """A use on the holder's own lease; made by `AsyncLease.use`."""
 
     def __init__(self, lease: AsyncLease, label: str) -> None:
+        if len(label) > NAME_MAX_CHARS:
+            raise BadRequest(
+                f"expected a label of at most {NAME_MAX_CHARS} characters, got {len(label)}",
+                hint="shorten it",
+            )
         self._use_id = UseId(f"{lease.lease_id}/{lease._driver.new_id()}")
         self._lease = lease
         self._label = label
@@ -332,24 +350,40 @@ class AsyncUse:
     def use_id(self) -> UseId:
         return self._use_id
 
-    async def _begin(self) -> None:
-        """Begin the use. Raises LeaseRevoking or LeaseLost if the lease leaves."""
-        lease = self._lease
-        lease._raise_if_leaving()
-        await lease._until_loaded()
-        lease._departure.uses.add(self.use_id)
-        driver = lease._driver
+    def _begin_ahead(self) -> bool:
+        """Begin the use of a lease that cannot have ended: from here on it does not leave, and
+        `_tell` has to follow. False: ask (`_begin`). Any thread may call."""
+        lease, driver = self._lease, self._lease._driver
+        now, ahead_from = driver.now(), lease._ahead_from
+        lease._ahead_from = now + PAUSE_S
+        return (
+            now >= ahead_from
+            and lease._departure.enter(self.use_id)
+            # last: a lease that was away in between is not held before it is loaded
+            and driver.protocol.holdings.is_certain(lease._record, now)
+        )
+
+    def _tell(self) -> int:
+        """Tell the arbiter; return the request. Where it refuses a use that has begun, the lease
+        was revoked in that moment, and leaves after the use."""
+        lease, driver = self._lease, self._lease._driver
         request = driver.protocol.holdings.use_begin(
             lease._record, self.use_id, self._label, driver.now()
         )
-        try:
-            if lease._record.held:
-                await driver.told(request)
-            else:  # the answer lets the next model load
-                await driver.reply(request)
-        except BaseException:
-            lease._departure.uses.discard(self.use_id)
-            raise
+        driver.pump()
+        return request
+
+    async def _begin(self) -> None:
+        """Begin the use as the arbiter answers. Raises LeaseRevoking or LeaseLost if the lease
+        leaves."""
+        lease, driver = self._lease, self._lease._driver
+        lease._raise_if_leaving()
+        await lease._until_loaded()
+        lease._departure.uses.add(self.use_id)
+        if lease._record.held:
+            await driver.told(self._tell())
+        else:  # the answer lets the next model load
+            await driver.reply(self._tell())
 
     def _end(self) -> None:
         """End the use, or what has begun of it, without waiting for the arbiter."""

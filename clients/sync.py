@@ -242,7 +242,10 @@ class Lease(_Blocking[AsyncLease]):
         """Mark a busy interval: the holder is not evicted inside it; see `AsyncLease.use`."""
         use = AsyncUse(self._twin, label)
         try:
-            self._portal.call(use._begin)
+            if use._begin_ahead():
+                self._portal.soon(use._tell)
+            else:
+                self._portal.call(use._begin)
             use_context.enter(use.use_id, use.name)
             yield Use(self._portal, use)
         finally:

@@ -234,6 +234,11 @@ class Holdings:
             if record.wanted and record.wanted_until is not None:
                 yield self._connection.wait_ends_at(record.wanted_until)
 
+    def is_certain(self, record: LeaseRecord, now: float) -> bool:
+        """Return whether a lease is held, and was confirmed so lately that its TTL cannot be over
+        for the arbiter."""
+        return record.held and now < record.confirmed_at + record.ttl_s
+
     def fence_at(self, record: LeaseRecord) -> float:
         return record.confirmed_at + record.ttl_s + self._connection.grace_s
 

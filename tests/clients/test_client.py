@@ -21,6 +21,7 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.defaults import STATUS_PAGE
 from vram_arbiter.schemas.errors import (
     ArbiterUnreachable,
+    BadRequest,
     LeaseLost,
     LeaseRevoking,
     LimitExceeded,
@@ -281,6 +282,9 @@ async def test_a_use_needs_the_right_token_and_is_forgotten_at_its_end(
         with pytest.raises(StaleToken):
             async with client.use(lease.lease_id, (1, 999)):
                 pytest.fail("a use began with a wrong token")
+        with pytest.raises(BadRequest, match="at most 128"):
+            async with lease.use("x" * 129):
+                pytest.fail("a use began with a label that the arbiter refuses")
         async with client.use(lease.lease_id, lease.token, "goal"):
             assert len(client._session._foreign_uses) == 1
         assert len(client._session._foreign_uses) == 0

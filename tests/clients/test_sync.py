@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.leases import Spec
+from tests.support.leases import Spec, view_of
 from tests.support.process import ArbiterProcess
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, until
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.errors import ArbiterUnreachable, BadState, LeaseLost, LeaseRevoking
 
@@ -57,6 +57,47 @@ def test_revoked_between_uses_in_a_worker_thread(client: Client, spec: Spec) -> 
     assert granted
     assert unloaded.is_set()
     assert not loop_thread.is_set()
+
+
+def test_a_use_that_begins_as_the_lease_is_revoked_keeps_it(
+    client: Client, arbiter_daemon: ArbiterProcess, spec: Spec
+) -> None:
+    """It waits neither for the arbiter nor for the client's thread, and the arbiter refuses it; the
+    model stays until its end."""
+    busy, go, unloaded, granted = (threading.Event() for _ in range(4))
+
+    def hold_up(_: str) -> None:
+        busy.set()
+        assert go.wait(PATIENCE_S)
+
+    def wait_for_room() -> None:
+        other.acquire(spec("b", 5))
+        granted.set()
+
+    lease = client.acquire(spec("a", 5), unload=unloaded.set)
+    lease.ready()
+    client.on_prepare(hold_up)
+    with Client("waiter", endpoint=arbiter_daemon.endpoint) as other:
+        other.prepare(client.name)
+        assert busy.wait(PATIENCE_S)
+        waiting = threading.Thread(target=wait_for_room)
+        waiting.start()
+        until(lambda: view_of(other, "a").state == "revoking")
+        with lease.use("crossing"):
+            assert lease.state == "held", "it has not heard of the revoke"
+            go.set()
+            assert lease.wait_change("held") == "revoking"
+            with pytest.raises(LeaseRevoking), lease.use():
+                pytest.fail("a use began on a lease that is asked to leave")
+            assert view_of(other, "a").state == "revoking"
+            assert not unloaded.is_set()
+            assert not granted.is_set()
+        waiting.join(PATIENCE_S)
+        assert unloaded.is_set()
+        assert granted.is_set()
+        daemon = other.status().daemon
+        assert daemon is not None
+        assert daemon.refusals["lease_revoking"] == 1
 
 
 def test_a_call_in_the_clients_own_thread_is_refused(client: Client) -> None:
