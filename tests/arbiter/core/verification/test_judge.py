@@ -1,6 +1,7 @@
 """Whole judgements of single readings, each at its edge: one byte more or one moment earlier is
 judged otherwise."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -40,7 +41,7 @@ def process(pid: int) -> ProcessKey:
     return ProcessKey(pid, 7 * pid)
 
 
-def reading(at: float, used: int, listed: dict[int, int | None] | None) -> MemorySampled:
+def reading(at: float, used: int, listed: Mapping[int, int | None] | None) -> MemorySampled:
     """A reading by pid; None: a total alone."""
     uses = None
     if listed is not None:
@@ -82,7 +83,10 @@ class World:
     def debt(self, pid: int, lease: str | None, confirmed_at: float) -> None:
         """A verification of another process."""
         one = replace(
-            RELEASED, key=f"debt{pid}", process=process(pid), lease=lease and LeaseId(lease)
+            RELEASED,
+            key=f"debt{pid}",
+            process=process(pid),
+            lease=None if lease is None else LeaseId(lease),
         )
         one.confirmed_at = confirmed_at
         self.gpu.verifications[one.key] = one
@@ -219,7 +223,13 @@ OVERDUE: dict[str, Case] = {
     ),
     "it came back after all": ({}, reading(20, 380, SEEN), Others(), BACK),
 }  # fmt: skip
-CASES = {**IN_TIME, **{name: ({**c, **LATE}, *more) for name, (c, *more) in OVERDUE.items()}}
+CASES: dict[str, Case] = {
+    **IN_TIME,
+    **{
+        name: ({**changes, **LATE}, shown, others, expected)
+        for name, (changes, shown, others, expected) in OVERDUE.items()
+    },
+}
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -257,7 +267,7 @@ def test_bytes_of_nobody_that_may_have_gone_instead_hide_none_of_the_lease(
     used: int,
     others: Others,
     changes: dict[str, Any],
-    listed: dict[int, int | None] | None,
+    listed: Mapping[int, int | None] | None,
     expected: Judgement | None,
 ) -> None:
     """200 bytes are unattributed, and 80 are of a stowaway."""
@@ -329,7 +339,7 @@ def loads(world: World) -> int:
     ("shown", "seen"), [(None, 0), ({2: 350, 3: 100}, 200 + 100), ({2: 600, 3: 501}, 400 + 500)]
 )
 def test_a_total_tells_no_load_from_bytes_that_have_not_gone(
-    shown: dict[int, int | None] | None, seen: int
+    shown: Mapping[int, int | None] | None, seen: int
 ) -> None:
     world = World()
     loading_bytes = loads(world) - seen
