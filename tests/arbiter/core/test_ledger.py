@@ -1,5 +1,9 @@
 """Bytes of one GPU: folding of residues, debts, evidence, stowaways."""
 
+from dataclasses import replace
+
+import pytest
+
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
 from vram_arbiter.arbiter.core.ledger import GpuLedger, bytes_of
 from vram_arbiter.arbiter.core.settings import GpuInfo
@@ -95,6 +99,7 @@ def test_evidence_counts_only_above_the_booking_and_only_if_it_is_new() -> None:
     assert books.total_if(joining=[(B, 100)]) == 800
     books.observe(sample(13.0, 0), quiet=True)
     assert books.total_bytes() == 500, "gone from the list: only the booking counts"
+    assert books.accounts[A].measured_bytes == 0
 
 
 def test_pressure_is_what_exceeds_the_budget() -> None:
@@ -124,6 +129,7 @@ def test_a_process_known_by_pid_alone_is_found() -> None:
     books.observe(sample(1.0, 200, (unknown_start, 200)), quiet=True)
     assert books.total_if(joining=[(A, 500)]) == 500
     books.charge(LA, A, 500, 500, 2.0)
+    assert (books.total_bytes(), books.stowaways) == (500, {}), "it is no stowaway from now on"
     books.observe(sample(3.0, 600, (unknown_start, 600), (ProcessKey(77, 0), 5)), quiet=True)
     assert books.accounts[A].held_bytes - books.accounts[A].charged_bytes == 100
     assert [s.process.pid for s in books.stowaways.values()] == [77]
@@ -181,7 +187,34 @@ def test_while_the_drivers_own_bytes_were_never_seen_none_are_known() -> None:
     assert books.unlisted_bytes(sample(1.0, 150, (C, 100))) == 50, "another container's, maybe"
 
 
-def test_one_process_may_hold_the_whole_gpu() -> None:
+@pytest.mark.parametrize(
+    ("used", "total", "held", "says"),
+    [
+        (1010, 1000, 1010, ""),
+        (0, 990, 0, ""),
+        (0, 989, 0, "989 bytes of memory, 1000 are leased out"),
+        (1011, 1000, 0, "1011 of 1000 bytes are used"),
+        (-1, 1000, 0, "-1 of 1000 bytes are used"),
+        (500, 1000, 1011, "process 2 holds 1011 of 1000 bytes"),
+        (500, 1000, -1, "process 2 holds -1 of 1000 bytes"),
+    ],
+)
+def test_a_reading_is_impossible_beyond_the_tolerance(
+    used: int, total: int, held: int, says: str
+) -> None:
+    """One process may hold the whole GPU; the second of the list is looked at too."""
+    reading = replace(sample(1.0, used, (A, None), (B, held)), total_bytes=total)
+    assert ledger().impossible(reading) == (says and f"impossible reading: {says}")
+
+
+def test_bytes_that_may_be_pending_free_are_neither_unattributed_nor_the_drivers() -> None:
     books = ledger()
-    assert books.impossible(sample(1.0, 1000, (A, 1000))) == ""
-    assert books.impossible(sample(1.0, 1000, (A, 1100))) != ""
+    books.observe(sample(1.0, 250), quiet=True, pending_bytes=250)
+    assert (books.unattributed_bytes, driver_bytes(books)) == (0, None), "all of it may be"
+    books.observe(sample(2.0, 250), quiet=True, pending_bytes=100)
+    assert (books.unattributed_bytes, driver_bytes(books)) == (50, 100)
+    books.observe(sample(3.0, 120), quiet=True, pending_bytes=80)
+    assert (books.unattributed_bytes, driver_bytes(books)) == (20, 100), "20 of 50 are still there"
+    books.observe(sample(4.0, 70), quiet=True, pending_bytes=30)
+    assert (books.unattributed_bytes, driver_bytes(books)) == (0, 70)
+    assert books.total_bytes() == 0

@@ -43,11 +43,20 @@ def test_a_lease_as_it_is_shown(driver: CoreDriver, exclusive: bool, mode: str) 
     assert (view["charge_bytes"], view["pid"]) == (2 * GIB, person.process.pid)
 
 
+NO_LEASE = {"lease_ids": [], "charged_bytes": 0, "residue_bytes": 0, "stowaway": True}
+
+
 def test_a_gpu_as_it_is_shown(driver: CoreDriver) -> None:
-    held(driver, "det", 2)
+    det, lease = held(driver, "det", 2)
+    driver.device.names[ProcessKey(9, 9)] = "browser"
+    driver.device.set(ProcessKey(9, 9), MIB, driver.now)
+    driver.device.set(ProcessKey(8, 8), 2 * MIB, driver.now)
+    driver.advance(1.5)
+    sample = driver.arbiter.inspect().gpus[driver.device.gpu].sample
+    assert sample is not None
     shown = driver.gpu()
-    shown.pop("sample_age_s")
-    (process,) = shown.pop("processes")
+    assert shown.pop("sample_age_s") == driver.now - sample.taken_at
+    process, *stowaways = shown.pop("processes")
     assert shown == {
         "gpu": "GPU-0",
         "index": 0,
@@ -56,16 +65,80 @@ def test_a_gpu_as_it_is_shown(driver: CoreDriver) -> None:
         "capacity_bytes": 8 * GIB,
         "reserve_bytes": d.RESERVE_BYTES,
         "charged_bytes": 2 * GIB,
-        "stowaway_bytes": 0,
-        "measured_used_bytes": 2 * GIB,
+        "stowaway_bytes": 3 * MIB,
+        "measured_used_bytes": 2 * GIB + 3 * MIB,
         "pressure_bytes": 0,
         "blocked": None,
     }
-    assert (process["name"], process["used_bytes"], process["charged_bytes"]) == (
-        "det",
-        2 * GIB,
-        2 * GIB,
-    )
+    assert process == {
+        "pid": det.process.pid,
+        "name": "det",
+        "used_bytes": 2 * GIB,
+        "lease_ids": [lease],
+        "charged_bytes": 2 * GIB,
+        "residue_bytes": 0,
+        "stowaway": False,
+    }
+    assert stowaways == [
+        {"pid": 8, "name": "p8", "used_bytes": 2 * MIB, **NO_LEASE},
+        {"pid": 9, "name": "browser", "used_bytes": MIB, **NO_LEASE},
+    ]
+    noted = [(note["gpu"], note["pid"], note["name"]) for note in driver.notes("stowaway")]
+    assert noted == [("GPU-0", 8, "p8"), ("GPU-0", 9, "browser")]
+
+
+def test_what_is_in_a_waiters_way_is_told_whole(driver: CoreDriver) -> None:
+    """A holder, a lease that is over and not measured gone, and two stowaways."""
+    det, _ = held(driver, "det", 2)
+    _, lease = held(driver, "holder", 3, evictable=False)
+    driver.device.names[ProcessKey(9, 9)] = "browser"
+    driver.device.names[ProcessKey(8, 8)] = ""
+    driver.device.set(ProcessKey(9, 9), 2 * MIB, driver.now)
+    driver.device.set(ProcessKey(8, 8), MIB, driver.now)
+    driver.advance(1.5)
+    driver.device.lag_s = 60.0
+    det.die()
+    driver.consumer("w").acquire(5 * GIB)
+    told = only(driver.why("w")["leases"])
+    blockers = [{k: v for k, v in one.items() if k != "text"} for one in told["blockers"]]
+    nothing: dict[str, Any] = {"lease_id": None, "uses": 0}
+    assert blockers == [
+        {
+            "lease_id": lease,
+            "consumer": "holder",
+            "bytes": 3 * GIB,
+            "state": "held",
+            "uses": 0,
+            "condition": "pinned",
+        },
+        {
+            **nothing,
+            "consumer": f"pid {det.process.pid}",
+            "bytes": 2 * GIB,
+            "state": "debt",
+            "condition": "debt",
+            "pid": det.process.pid,
+        },
+        {
+            **nothing,
+            "consumer": "pid 8",
+            "bytes": MIB,
+            "state": "stowaway",
+            "condition": "stowaway",
+            "pid": 8,
+        },
+        {
+            **nothing,
+            "consumer": "browser",
+            "bytes": 2 * MIB,
+            "state": "stowaway",
+            "condition": "stowaway",
+            "pid": 9,
+        },
+    ]
+    assert told["measuring"] == ["det"]
+    assert "expected_bytes" not in told
+    assert driver.status()["drained"] == ""
 
 
 def test_why_of_a_resident_lease_asks_for_nothing(driver: CoreDriver) -> None:
