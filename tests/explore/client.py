@@ -90,6 +90,7 @@ class Client:
 
     def act(self, verb: str, world: "World") -> None:
         """Do it. Raises what must not be raised."""
+        world.touched.add(self.name)
         getattr(self, f"do_{verb}")(world)
         self._absorb()
 
@@ -221,10 +222,12 @@ class Client:
     def is_waiting(self) -> bool:
         return bool(self.protocol.waits.waiters)
 
-    def tick(self, now: float) -> None:
+    def tick(self, world: "World") -> None:
+        """Let it do what is due."""
         due = self.protocol.next_deadline()
-        if due is not None and due <= now:
-            self.protocol.tick(now)
+        if due is not None and due <= world.now:
+            world.touched.add(self.name)
+            self.protocol.tick(world.now)
             self._absorb()
 
     def decisive_times(self) -> Iterator[float]:

@@ -17,7 +17,7 @@ GPUs are not renamed: the engine breaks ties by their index, so that two of them
 
 from bisect import bisect
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from hashlib import blake2b
@@ -95,6 +95,9 @@ class _Part:
         self.moments: list[int] = []
 
     def put(self, *values: Any) -> None:
+        self.put_all(values)
+
+    def put_all(self, values: Iterable[Any]) -> None:
         row, names = self.row, self.names
         for value in values:
             kind = type(value)
@@ -108,6 +111,8 @@ class _Part:
                 if named is None and value[:1] == "L" and value[1:2].isdigit():
                     named = self.name(value)  # a lease
                 row.append(value if named is None else named)
+            elif not value:
+                row.append(0)
             else:
                 _WRITERS[kind](self, value)
 
@@ -149,16 +154,16 @@ def _writer(kind: type) -> _Writer:
     if issubclass(kind, dict):
         return _write_table
     if issubclass(kind, set | frozenset):
-        return lambda part, some: part.put(len(some), *_sorted(part, some))
+        return lambda part, some: part.put_all((len(some), *_sorted(part, some)))
     if issubclass(kind, list | tuple | deque):
-        return lambda part, some: part.put(len(some), *some)
+        return lambda part, some: part.put_all((len(some), *some))
     return _record_writer()
 
 
 def _write_table(part: _Part, table: dict[Any, Any]) -> None:
     part.row.append(len(table))
     for key in _sorted(part, table):
-        part.put(key, table[key])
+        part.put_all((key, table[key]))
 
 
 def _sorted(part: _Part, keys: Any) -> Any:
@@ -166,15 +171,29 @@ def _sorted(part: _Part, keys: Any) -> Any:
 
 
 def _record_writer() -> _Writer:
-    getters: list[Callable[[Any], Any]] = []  # made with the first value: it knows its fields
+    getter: Callable[[Any], Any] | None = None  # made with the first value: it knows its fields
 
     def write(part: _Part, value: Any) -> None:
-        if not getters:
-            every = [one.name for one in fields(value)] if is_dataclass(value) else vars(value)
-            getters.extend(attrgetter(name) for name in every if name not in LEFT_OUT)
-        part.put(*[get(value) for get in getters])
+        nonlocal getter
+        if getter is None:
+            # the class twice: a getter of one name returns no tuple
+            getter = attrgetter("__class__", "__class__", *_fields(value))
+        part.put_all(getter(value)[2:])
 
     return write
+
+
+def _fields(record: Any) -> Iterator[str]:
+    """Yield the names of what is written of a record, and of the records that it always has."""
+    hints = {one.name: one.type for one in fields(record)} if is_dataclass(record) else {}
+    for name in hints or vars(record):
+        if name in LEFT_OUT:
+            continue
+        inner = getattr(record, name)
+        if is_dataclass(inner) and hints.get(name) is type(inner):
+            yield from (f"{name}.{one}" for one in _fields(inner))
+        else:
+            yield name
 
 
 # -- the parts of a world

@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
-from tests.explore.cloning import Freezer, Frozen, thaw
+from tests.explore.cloning import Freezer, Parts, thaw, undo
 from tests.explore.fingerprint import fingerprint
 from tests.explore.world import Action, Scenario, World
 
@@ -119,11 +119,11 @@ class Search:
         report.wall_s, report.cpu_s = time.perf_counter() - began, time.process_time() - cpu
         return report
 
-    def _explore(self, until: float, states_max: int) -> list[tuple[int, Frozen]]:
+    def _explore(self, until: float, states_max: int) -> list[tuple[int, Parts]]:
         """Explore layer by layer. Return the states that are met and not explored."""
         report, world = self.report, World(self._scenario)
         self._meet(world, 0, ("start", ""))
-        layer, following = [(0, self._freezer.freeze(world))], list[tuple[int, Frozen]]()
+        layer, following = [(0, self._freezer.freeze(world, {}))], list[tuple[int, Parts]]()
         while layer:
             for place, (state, frozen) in enumerate(layer):
                 if time.perf_counter() > until or len(self._parents) >= states_max or report.error:
@@ -136,10 +136,12 @@ class Search:
             report.depth += bool(layer)
         return []
 
-    def _expand(self, state: int, frozen: Frozen, following: list[tuple[int, Frozen]]) -> None:
-        report, world = self.report, thaw(frozen)
+    def _expand(self, state: int, frozen: Parts, following: list[tuple[int, Parts]]) -> None:
+        report, freezer = self.report, self._freezer
+        world = thaw(frozen)
         for number, action in enumerate(world.actions()):
-            world = thaw(frozen) if number else world
+            if number:
+                undo(world, frozen)
             try:
                 world.act(action)
             except Exception as error:  # noqa: BLE001 - whatever it is, it is what is looked for
@@ -149,7 +151,7 @@ class Search:
             report.verbs[action[0]] = report.verbs.get(action[0], 0) + 1
             met, is_new = self._meet(world, state, action)
             if is_new:
-                following.append((met, self._freezer.freeze(world)))
+                following.append((met, freezer.freeze(world, frozen)))
             else:
                 report.merged += 1
             if action[0] in SERVE and met != state:
@@ -178,7 +180,7 @@ class Search:
         self.report.story, self.report.error = story, error
 
     # -- liveness
-    def _check_served(self, edge: list[tuple[int, Frozen]], until: float) -> None:
+    def _check_served(self, edge: list[tuple[int, Parts]], until: float) -> None:
         """Look for a state from which no path serves those that wait."""
         report, served = self.report, self._served
         self._spread()

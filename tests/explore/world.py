@@ -51,6 +51,7 @@ LIES: Mapping[str, int] = {"nothing": 0, "everything": CAPACITY_BYTES, "nonsense
 """Bytes that a lying reading shows as used."""
 FAULTS = frozenset({"cancel", "crash", "drop", "fail", "late", "lie", "restart"})
 """Verbs that happen only where a scenario allows it, and so often."""
+REST = "rest"
 _PERIODIC = ("probe", "verify", "revoke")
 
 type Action = tuple[str, str]
@@ -144,6 +145,7 @@ class World:
     engine: Arbiter
 
     def __init__(self, scenario: Scenario) -> None:
+        self.touched = {REST}
         self.scenario, self.left = scenario, dict(scenario.faults)
         self.now, self.epoch = START_S, 0
         gpus = [info.id for info in _settings(scenario.gpus, 1).gpus]
@@ -163,6 +165,21 @@ class World:
             self._deliver(mail=True, readings=True)
         for action in story(scenario.after):
             self.act(action)
+
+    # -- its parts
+    def parts(self) -> dict[str, Any]:
+        """Return what shares nothing that changes: the engine, each client, the rest."""
+        apart = ("engine", "clients", "touched")
+        rest = {name: value for name, value in vars(self).items() if name not in apart}
+        return {REST: rest, "engine": self.engine, **self.clients}
+
+    def put_back(self, name: str, part: Any) -> None:
+        if name == REST:
+            vars(self).update(part)
+        elif name == "engine":
+            self.engine = part
+        else:
+            self.clients[name] = part
 
     # -- what may happen
     def actions(self) -> list[Action]:
@@ -192,7 +209,8 @@ class World:
         else:
             getattr(self, f"do_{verb}")(*whose.split())
         self._deliver(mail=not self.scenario.talks, readings=self.scenario.talks)
-        check_arbiter(self.engine)
+        if "engine" in self.touched:
+            check_arbiter(self.engine)
         self._check(state_of(self.engine))
 
     def _deliver(self, *, mail: bool, readings: bool) -> None:
@@ -211,6 +229,7 @@ class World:
     def post(self, event: ev.Event) -> None:
         """Hand an event to the engine and perform what it asks, as the executor does."""
         self.now += STEP_S
+        self.touched.add("engine")
         effects = self.engine.handle(event, self.now)
         for effect in effects:
             match effect:
@@ -234,6 +253,7 @@ class World:
     def _tell(self, to: ClientId, told: Told, re: RequestId | None) -> None:
         client = self.clients.get(to.partition("-")[0])
         if client is not None and client.client == to:
+            self.touched.add(client.name)
             client.tell(told, re, self.epoch)
 
     def hold(self, process: ProcessKey, gpu: GpuId, count: int) -> None:
@@ -255,6 +275,7 @@ class World:
         for device in self.devices.values():
             device.reading, device.again = None, False
         for client in self.clients.values():
+            self.touched.add(client.name)
             client.cut_off()
         records = dict(self.journal)
         self.post(ev.Recovered(records) if records else ev.Tick())
@@ -332,7 +353,7 @@ class World:
             if self.now > device.freed_at + LAG_S:
                 device.late.clear()
         for client in self.clients.values():
-            client.tick(self.now)
+            client.tick(self)
         due = self.engine.next_deadline()
         if due is not None and due <= self.now:
             self.post(ev.Tick())
