@@ -11,7 +11,7 @@ import importlib
 import io
 import itertools
 import pickle
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from enum import Enum
 from functools import cache
@@ -19,7 +19,7 @@ from operator import getitem
 from types import CellType, CodeType, FunctionType
 from typing import Any
 
-from tests.explore.world import REST, World
+from tests.explore.world import World
 
 type Parts = dict[str, Frozen]
 type Frozen = tuple[bytes, list[object], _Words]
@@ -90,21 +90,13 @@ class Freezer:
         return frozen
 
 
-def thaw(parts: Parts) -> World:
-    """Return a fresh copy of the world that was frozen."""
-    world = World.__new__(World)
-    world.clients = {}
-    world.touched = set(parts)
-    undo(world, parts)
+def thaw(parts: Parts, world: World) -> World:
+    """Bring a world to what was frozen. What it is in already, untouched, stays."""
+    for name, frozen in parts.items():
+        if name in world.touched or world.origin.get(name) is not frozen:
+            world.put_back(name, _thaw(frozen))
+    world.origin, world.touched = parts, set()
     return world
-
-
-def undo(world: World, parts: Parts) -> None:
-    """Bring a world that was thawed from these parts back to them."""
-    for name in parts:  # clients in their order
-        if name in world.touched:
-            world.put_back(name, _thaw(parts[name]))
-    world.touched = {REST}
 
 
 def _thaw(frozen: Frozen) -> Any:
@@ -165,6 +157,10 @@ def _fill(cell: CellType, contents: tuple[object]) -> None:
     (cell.cell_contents,) = contents
 
 
+def _reduce_deque(some: deque[Any]) -> Any:
+    return deque, (list(some), some.maxlen)
+
+
 def _reduce_count(numbers: "itertools.count[int]") -> Any:
     return itertools.count, (int(repr(numbers)[len("count(") : -1]),)
 
@@ -173,5 +169,6 @@ _UNCHANGING = (Enum, CodeType, tuple)  # a tuple of a class of its own is a name
 _OTHERS: dict[type, Callable[[Any], Any]] = {
     FunctionType: _reduce_function,
     CellType: _reduce_cell,
+    deque: _reduce_deque,
     itertools.count: _reduce_count,
 }

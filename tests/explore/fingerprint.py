@@ -20,7 +20,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from hashlib import blake2b
 from marshal import dumps
 from operator import attrgetter
 from types import NoneType
@@ -52,6 +51,7 @@ _LEFT_OUT_BECAUSE: Mapping[str, str] = {
 }
 LEFT_OUT = frozenset(name for names in _LEFT_OUT_BECAUSE.values() for name in names.split())
 """Fields of any record by name."""
+_NAMED = frozenset({str, ProcessKey, Token})
 _PLAIN = frozenset({int, bool, NoneType})
 _NOISE = frozenset({"seq", "epoch", "message", "hint", "details", "instance", "nonce", "pid"})
 """Of messages."""
@@ -59,8 +59,8 @@ type Names = dict[object, int]
 
 
 def fingerprint(world: World) -> int:
-    """Return 64 bits that tell a world from those that are not the same."""
-    return int.from_bytes(blake2b(canonical(world), digest_size=8).digest())
+    """Return 64 bits that tell a world from those that are not the same, in this process."""
+    return hash(canonical(world))
 
 
 def canonical(world: World) -> bytes:
@@ -106,10 +106,12 @@ class _Part:
             elif kind is float:
                 self.moments.append(len(row))
                 row.append(value)
-            elif kind is str:
+            elif kind in _NAMED:
                 named = names.get(value)
-                if named is None and value[:1] == "L" and value[1:2].isdigit():
-                    named = self.name(value)  # a lease
+                if named is None and (
+                    kind is not str or (value[:1] == "L" and value[1:2].isdigit())
+                ):
+                    named = names[value] = len(names) + 1
                 row.append(value if named is None else named)
             elif not value:
                 row.append(0)
@@ -147,8 +149,6 @@ _WRITERS = _Writers()
 def _writer(kind: type) -> _Writer:
     if issubclass(kind, Enum):
         return lambda part, value: part.row.append(value._value_)
-    if kind in (ProcessKey, Token):
-        return lambda part, value: part.row.append(part.name(value))
     if kind is LeaseSpec:
         return lambda part, value: part.row.append(value.consumer)
     if issubclass(kind, dict):
@@ -176,9 +176,14 @@ def _record_writer() -> _Writer:
     def write(part: _Part, value: Any) -> None:
         nonlocal getter
         if getter is None:
-            # the class twice: a getter of one name returns no tuple
-            getter = attrgetter("__class__", "__class__", *_fields(value))
-        part.put_all(getter(value)[2:])
+            names = list(_fields(value))
+            # a getter of one name returns no tuple
+            getter = (
+                attrgetter(*names)
+                if len(names) > 1
+                else lambda one: [getattr(one, name) for name in names]
+            )
+        part.put_all(getter(value))
 
     return write
 
@@ -203,7 +208,7 @@ def _client(core: Core, client: Client, names: Names) -> _Part:
     for number in (client.awaited, connection._handshake_id):
         part.put(part.name((client.process, number)))
     for number, pending in connection._pending.items():
-        part.put(part.name((client.process, number)), pending)
+        part.put_all((part.name((client.process, number)), pending))
         part.put(pending.request.TAG[1], pending.request)
     for message in (*client.up, {"": ""}, *client.down):
         _message(part, client, message)

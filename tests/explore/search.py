@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
-from tests.explore.cloning import Freezer, Parts, thaw, undo
+from tests.explore.cloning import Freezer, Parts, thaw
 from tests.explore.fingerprint import fingerprint
 from tests.explore.world import Action, Scenario, World
 
@@ -96,7 +96,7 @@ class Search:
 
     def __init__(self, scenario: Scenario) -> None:
         self.report = Report(scenario.name)
-        self._scenario = scenario
+        self._world = World(scenario)
         self._freezer = Freezer()
         self._known: dict[int, int] = {}
         self._parents, self._steps = array("I"), array("H")
@@ -121,7 +121,7 @@ class Search:
 
     def _explore(self, until: float, states_max: int) -> list[tuple[int, Parts]]:
         """Explore layer by layer. Return the states that are met and not explored."""
-        report, world = self.report, World(self._scenario)
+        report, world = self.report, self._world
         self._meet(world, 0, ("start", ""))
         layer, following = [(0, self._freezer.freeze(world, {}))], list[tuple[int, Parts]]()
         while layer:
@@ -137,11 +137,9 @@ class Search:
         return []
 
     def _expand(self, state: int, frozen: Parts, following: list[tuple[int, Parts]]) -> None:
-        report, freezer = self.report, self._freezer
-        world = thaw(frozen)
-        for number, action in enumerate(world.actions()):
-            if number:
-                undo(world, frozen)
+        report, freezer, world = self.report, self._freezer, self._world
+        for action in thaw(frozen, world).actions():
+            thaw(frozen, world)
             try:
                 world.act(action)
             except Exception as error:  # noqa: BLE001 - whatever it is, it is what is looked for
@@ -190,7 +188,7 @@ class Search:
             if served[state]:
                 continue
             try:
-                served[state] = serve(thaw(frozen))
+                served[state] = serve(thaw(frozen, self._world))
                 error = "" if served[state] else "a client waits for ever"
             except Exception as raised:  # noqa: BLE001 - as above
                 error = f"{type(raised).__name__}: {raised}, while those that wait are served"

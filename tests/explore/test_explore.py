@@ -8,7 +8,7 @@ from tests.explore.cloning import Freezer, thaw
 from tests.explore.fingerprint import canonical, fingerprint
 from tests.explore.scenarios import BIG, HELD, TALKS, kind
 from tests.explore.search import Search, play
-from tests.explore.world import CAPACITY_BYTES, OVERHEAD_BYTES, STEP_S, Scenario, story
+from tests.explore.world import CAPACITY_BYTES, OVERHEAD_BYTES, STEP_S, Scenario, World, story
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
 from vram_arbiter.arbiter.core.events import Asked, Event, MemorySampled, ProbeFailed
@@ -79,9 +79,11 @@ def test_a_waiter_that_no_path_serves_is_found() -> None:
 def test_a_copy_is_the_same_world_and_another(scenario: Scenario) -> None:
     world = play(scenario, story("acquire a, acquire b"))
     freezer, before = Freezer(), canonical(world)
-    frozen = [freezer.freeze(world) for _ in range(3)]  # each with more words than the one before
-    assert [canonical(thaw(one)) for one in frozen] == [before] * 3
-    copy = thaw(frozen[0])
+    frozen = [
+        freezer.freeze(world, {}) for _ in range(3)
+    ]  # each with more words than the one before
+    assert [canonical(thaw(one, World(scenario))) for one in frozen] == [before] * 3
+    copy = thaw(frozen[0], World(scenario))
     while copy.clients["a"].has_mail() or copy.clients["b"].has_mail():
         copy.act(next(action for action in copy.actions() if action[0] in ("send", "hear")))
     copy.act(next(action for action in copy.actions() if action[0] == "load"))

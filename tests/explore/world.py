@@ -145,7 +145,8 @@ class World:
     engine: Arbiter
 
     def __init__(self, scenario: Scenario) -> None:
-        self.touched = {REST}
+        self.origin: Mapping[str, object] = {}  # what its parts were thawed from
+        self.touched = set[str]()  # parts that may have changed since then
         self.scenario, self.left = scenario, dict(scenario.faults)
         self.now, self.epoch = START_S, 0
         gpus = [info.id for info in _settings(scenario.gpus, 1).gpus]
@@ -169,7 +170,7 @@ class World:
     # -- its parts
     def parts(self) -> dict[str, Any]:
         """Return what shares nothing that changes: the engine, each client, the rest."""
-        apart = ("engine", "clients", "touched")
+        apart = ("engine", "clients", "origin", "touched")
         rest = {name: value for name, value in vars(self).items() if name not in apart}
         return {REST: rest, "engine": self.engine, **self.clients}
 
@@ -202,6 +203,7 @@ class World:
     def act(self, action: Action) -> None:
         """Let something happen. Raises what must not be raised."""
         verb, whose = action
+        self.touched.add(REST)
         if verb in self.left:
             self.left[verb] -= 1
         if whose in self.clients:
