@@ -177,12 +177,8 @@ def _record_writer() -> _Writer:
         nonlocal getter
         if getter is None:
             names = list(_fields(value))
-            # a getter of one name returns no tuple
-            getter = (
-                attrgetter(*names)
-                if len(names) > 1
-                else lambda one: [getattr(one, name) for name in names]
-            )
+            # the module fills up: a getter of one name returns no tuple
+            getter = attrgetter(*names, *["__module__"] * (2 - len(names)))
         part.put_all(getter(value))
 
     return write

@@ -1,6 +1,8 @@
 """The explorer itself: a tiny world to its end, a seeded defect by its shortest story, and which
 worlds count as the same."""
 
+import random
+
 import pytest
 
 from tests.explore.client import Broken
@@ -89,6 +91,18 @@ def test_a_copy_is_the_same_world_and_another(scenario: Scenario) -> None:
     copy.act(next(action for action in copy.actions() if action[0] == "load"))
     assert canonical(copy) != before
     assert canonical(world) == before
+
+
+@pytest.mark.parametrize("scenario", [TWO, TALK], ids=lambda one: one.name)
+def test_what_an_action_does_not_touch_stays(scenario: Scenario) -> None:
+    world, chance = World(scenario), random.Random(0)
+    for _ in range(60):
+        action = chance.choice(thaw(Freezer().freeze(world, {}), world).actions())
+        before = Freezer().freeze(world, {})
+        world.act(action)
+        after = Freezer().freeze(world, {})
+        for name in before.keys() - world.touched:
+            assert after[name][:2] == before[name][:2], name
 
 
 # -- which worlds are the same
