@@ -33,6 +33,7 @@ from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.schemas.ids import ProcessKey, Token
+from vram_arbiter.schemas.wire.errors import Refusal
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 _LEFT_OUT_BECAUSE: Mapping[str, str] = {
@@ -45,6 +46,8 @@ _LEFT_OUT_BECAUSE: Mapping[str, str] = {
     " unloading_at released_at verdict_at wait_timeout_s",
     "it is of the protocol, and never changes": "foreign_uses _above _hello _connection _holdings"
     " instance epoch heartbeat_s grace_s view ttl_s deadline_in_s priority lists",
+    "it is of a message, and told alone": "message hint details pid since_s waited_s granted_s"
+    " ttl_left_s",
     "it is of the protocol, and an order of messages": "connections lives protocol up down record"
     " awaited _ids outgoing events _pending _handshake_id _handshake_at _heard_at reacquire_id"
     " request_id renewed_at deadline on_reply on_error",
@@ -53,8 +56,6 @@ LEFT_OUT = frozenset(name for names in _LEFT_OUT_BECAUSE.values() for name in na
 """Fields of any record by name."""
 _NAMED = frozenset({str, ProcessKey, Token})
 _PLAIN = frozenset({int, bool, NoneType})
-_NOISE = frozenset({"seq", "epoch", "message", "hint", "details", "instance", "nonce", "pid"})
-"""Of messages."""
 type Names = dict[object, int]
 
 
@@ -149,6 +150,8 @@ _WRITERS = _Writers()
 def _writer(kind: type) -> _Writer:
     if issubclass(kind, Enum):
         return lambda part, value: part.row.append(value._value_)
+    if issubclass(kind, Refusal):
+        return lambda part, value: part.put(value.code)
     if kind is LeaseSpec:
         return lambda part, value: part.row.append(value.consumer)
     if issubclass(kind, dict):
@@ -206,27 +209,13 @@ def _client(core: Core, client: Client, names: Names) -> _Part:
     for number, pending in connection._pending.items():
         part.put_all((part.name((client.process, number)), pending))
         part.put(pending.request.TAG[1], pending.request)
-    for message in (*client.up, {"": ""}, *client.down):
-        _message(part, client, message)
+    for mail in (client.up, client.down):
+        part.put(len(mail))
+        for re, body in mail:
+            part.put(re and part.name((client.process, re)), type(body).__name__, body)
     mine = {id: nonce for (process, nonce), id in core.nonces.items() if process == client.process}
     part.put(mine)
     return part
-
-
-def _message(part: _Part, client: Client, message: Mapping[str, Any]) -> None:
-    """A message without its numbers and times."""
-    for key, value in sorted(message.items()):
-        if key in _NOISE or isinstance(value, float):
-            continue
-        if key in ("id", "re"):
-            part.put(part.name((client.process, value)))
-        elif key == "token" and value is not None:
-            part.put(Token(*value))
-        elif isinstance(value, dict | list):
-            for one in value if isinstance(value, list) else [value]:
-                _message(part, client, one if isinstance(one, dict) else {"": one})
-        else:
-            part.put(key, value)
 
 
 def _gpu(core: Core, gpu: Gpu, device: Device, names: Names) -> _Part:

@@ -256,7 +256,7 @@ class World:
         client = self.clients.get(to.partition("-")[0])
         if client is not None and client.client == to:
             self.touched.add(client.name)
-            client.tell(told, re, self.epoch)
+            client.down.append((re, told))
 
     def hold(self, process: ProcessKey, gpu: GpuId, count: int) -> None:
         """A process holds so many bytes on a GPU from now on."""
