@@ -73,7 +73,22 @@ def test_a_waiter_that_no_path_serves_is_found() -> None:
     report = Search(Scenario("blind", (BIG,), engine=Blind)).run(60.0)
     assert report.error
     assert report.story == story("acquire a")
-    assert report.error == "no path serves those that wait"
+    assert report.error == "a client waits for ever"
+
+
+def test_a_deadline_that_comes_again_and_again_hides_no_other_one() -> None:
+    """The graph knew a client's ping alone of two deadlines, never the reading that grants, and said
+    that no path serves the other client."""
+    after = (
+        "acquire a, send a, hear a, load a, ready a, send a, drop a, sleep, "
+        "acquire b, send b, hear b, sleep, sleep"
+    )
+    late = Scenario("late", (TALKS, TALKS), after=after, talks=True)
+    report = Search(late).run(60.0)
+    assert not report.error, report
+    assert report.complete
+    assert report.served
+    assert report.unproven == 0
 
 
 # -- copies
