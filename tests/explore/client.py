@@ -18,12 +18,12 @@ from vram_arbiter.clients._protocol import records as r
 from vram_arbiter.clients._protocol.protocol import ClientProtocol
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, UseId
-from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.msgpack_codec import pack
 from vram_arbiter.schemas.wire import replies as y
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.errors import Refusal
 from vram_arbiter.schemas.wire.pushes import AnyPush
+from vram_arbiter.schemas.wire.requests import AnyRequest
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 if TYPE_CHECKING:
@@ -65,8 +65,8 @@ class Client:
         self.connections += 1
         self.client = ClientId(f"{self.name}-{self.connections}")
         self.linked = self.greeted = False
-        self.up: list[Message] = []
-        self.down: list[Message] = []
+        self.up: list[tuple[RequestId, AnyRequest]] = []
+        self.down: list[tuple[RequestId | None, Told]] = []
 
     # -- what it may do
     def actions(self) -> Iterator[str]:
@@ -90,6 +90,7 @@ class Client:
 
     def act(self, verb: str, world: "World") -> None:
         """Do it. Raises what must not be raised."""
+        world.touched.add(self.name)
         getattr(self, f"do_{verb}")(world)
         self._absorb()
 
@@ -162,7 +163,7 @@ class Client:
 
     def do_send(self, world: "World") -> None:
         """The session takes the oldest request (`rpc.session`)."""
-        envelope, request = codec.decode(pack(self.up.pop(0)), d.MESSAGE_MAX_BYTES)
+        number, request = self.up.pop(0)
         match request:
             case w.Hello():
                 self.greeted = True
@@ -170,24 +171,22 @@ class Client:
                 world.post(ev.ClientConnected(self.client, *known))
                 grace_s = state_of(world.engine).settings.fence_grace_s
                 welcome = (d.WIRE_VERSION, "boot", "server", "client", d.HEARTBEAT_S, grace_s)
-                self.tell(y.WelcomeReply(*welcome), envelope.id, world.epoch)
+                self.down.append((number, y.WelcomeReply(*welcome)))
             case w.Ping():
-                self.tell(y.PingReply("server"), envelope.id, world.epoch)
+                self.down.append((number, y.PingReply("server")))
             case _:
-                world.post(ev.Asked(self.client, envelope.id, request))
-
-    def tell(self, told: Told, re: RequestId | None, epoch: int) -> None:
-        """The session sends an answer, or a push."""
-        if isinstance(told, Refusal):
-            frame = codec.refusal(re, epoch, words.error_view(told))
-        elif isinstance(told, y.AnyReply):
-            frame = codec.reply(re or 0, epoch, told)
-        else:
-            frame = codec.push(0, epoch, told)
-        self.down.append(msgpack.unpackb(frame))
+                world.post(ev.Asked(self.client, number, request))
 
     def do_hear(self, world: "World") -> None:
-        self.protocol.connection.receive(self.down.pop(0), world.now)
+        """The oldest answer or push arrives."""
+        re, told = self.down.pop(0)
+        if isinstance(told, Refusal):
+            frame = codec.refusal(re, world.epoch, words.error_view(told))
+        elif isinstance(told, y.AnyReply):
+            frame = codec.reply(re or 0, world.epoch, told)
+        else:
+            frame = codec.push(0, world.epoch, told)
+        self.protocol.connection.receive(msgpack.unpackb(frame), world.now)
 
     def _absorb(self) -> None:
         """Take what the protocol tells its owner, and what it wants to send."""
@@ -210,7 +209,9 @@ class Client:
                     pass
         if self.over and not self.bytes:
             self.record, self.over, self.does = None, False, ""
-        self.up += connection.outgoing
+        for message in connection.outgoing:
+            envelope, request = codec.decode(pack(message), d.MESSAGE_MAX_BYTES)
+            self.up.append((envelope.id, request))
         connection.outgoing.clear()
 
     # -- what the world asks
@@ -221,10 +222,12 @@ class Client:
     def is_waiting(self) -> bool:
         return bool(self.protocol.waits.waiters)
 
-    def tick(self, now: float) -> None:
+    def tick(self, world: "World") -> None:
+        """Let it do what is due."""
         due = self.protocol.next_deadline()
-        if due is not None and due <= now:
-            self.protocol.tick(now)
+        if due is not None and due <= world.now:
+            world.touched.add(self.name)
+            self.protocol.tick(world.now)
             self._absorb()
 
     def decisive_times(self) -> Iterator[float]:

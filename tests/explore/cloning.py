@@ -11,6 +11,7 @@ import importlib
 import io
 import itertools
 import pickle
+from collections import Counter, deque
 from collections.abc import Callable
 from enum import Enum
 from functools import cache
@@ -18,6 +19,9 @@ from operator import getitem
 from types import CellType, CodeType, FunctionType
 from typing import Any
 
+from tests.explore.world import World
+
+type Parts = dict[str, Frozen]
 type Frozen = tuple[bytes, list[object], _Words]
 """The pickle of a world, the objects that it refers to, and the words that it is written in."""
 
@@ -59,30 +63,43 @@ def _primer(words: list[object]) -> bytes:
 
 
 class Freezer:
-    """Makes copies, with words that it learns from the worlds that it meets."""
+    """Makes copies, with words that it learns from the parts that it meets."""
 
     def __init__(self) -> None:
-        self._words = _Words([_shared, getitem])
-        self._count = 0
+        self._words: dict[str, _Words] = {}
+        self._count: Counter[str] = Counter()
 
-    def freeze(self, world: object) -> Frozen:
-        """Return a copy that `thaw` brings to life, any number of times."""
+    def freeze(self, world: World, before: Parts) -> Parts:
+        """Return a copy of a world that began as `before` (empty: it is new) and was touched."""
+        parts = world.parts()
+        touched = world.touched if before else parts
+        return before | {name: self._freeze(name, parts[name]) for name in touched}
+
+    def _freeze(self, name: str, part: object) -> Frozen:
         _shared.clear()
         buffer = io.BytesIO()
-        pickler, words = _Pickler(buffer, 3), self._words
+        pickler, words = _Pickler(buffer, 3), self._words.get(name) or _Words([_shared, getitem])
         pickler.memo = words.written.memo
-        pickler.dump(world)
+        pickler.dump(part)
         data = buffer.getvalue()
         frame = pickle.FRAME + len(data).to_bytes(8, "little")  # read at once
         frozen = frame + data, _shared.copy(), words
-        self._count += 1
-        if self._count & (self._count - 1) == 0:  # ever more rarely
-            self._words = words.with_those_of(pickler)
+        self._count[name] += 1
+        if self._count[name].bit_count() == 1:  # ever more rarely
+            self._words[name] = words.with_those_of(pickler)
         return frozen
 
 
-def thaw(frozen: Frozen) -> Any:
-    """Return a fresh copy of what was frozen."""
+def thaw(parts: Parts, world: World) -> World:
+    """Bring a world to what was frozen. What it is in already, untouched, stays."""
+    for name, frozen in parts.items():
+        if name in world.touched or world.origin.get(name) is not frozen:
+            world.put_back(name, _thaw(frozen))
+    world.origin, world.touched = parts, set()
+    return world
+
+
+def _thaw(frozen: Frozen) -> Any:
     data, _shared[:], words = frozen
     unpickler = pickle.Unpickler(io.BytesIO(data))
     unpickler.memo = words.read.memo
@@ -140,6 +157,10 @@ def _fill(cell: CellType, contents: tuple[object]) -> None:
     (cell.cell_contents,) = contents
 
 
+def _reduce_deque(some: deque[Any]) -> Any:
+    return deque, (list(some), some.maxlen)
+
+
 def _reduce_count(numbers: "itertools.count[int]") -> Any:
     return itertools.count, (int(repr(numbers)[len("count(") : -1]),)
 
@@ -148,5 +169,6 @@ _UNCHANGING = (Enum, CodeType, tuple)  # a tuple of a class of its own is a name
 _OTHERS: dict[type, Callable[[Any], Any]] = {
     FunctionType: _reduce_function,
     CellType: _reduce_cell,
+    deque: _reduce_deque,
     itertools.count: _reduce_count,
 }

@@ -17,10 +17,9 @@ GPUs are not renamed: the engine breaks ties by their index, so that two of them
 
 from bisect import bisect
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from hashlib import blake2b
 from marshal import dumps
 from operator import attrgetter
 from types import NoneType
@@ -34,6 +33,7 @@ from vram_arbiter.arbiter.core.model.gpu import Gpu
 from vram_arbiter.arbiter.core.model.records import LeaseRecord
 from vram_arbiter.arbiter.core.model.state import Core
 from vram_arbiter.schemas.ids import ProcessKey, Token
+from vram_arbiter.schemas.wire.errors import Refusal
 from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 _LEFT_OUT_BECAUSE: Mapping[str, str] = {
@@ -46,21 +46,22 @@ _LEFT_OUT_BECAUSE: Mapping[str, str] = {
     " unloading_at released_at verdict_at wait_timeout_s",
     "it is of the protocol, and never changes": "foreign_uses _above _hello _connection _holdings"
     " instance epoch heartbeat_s grace_s view ttl_s deadline_in_s priority lists",
+    "it is of a message, and told alone": "message hint details pid since_s waited_s granted_s"
+    " ttl_left_s",
     "it is of the protocol, and an order of messages": "connections lives protocol up down record"
     " awaited _ids outgoing events _pending _handshake_id _handshake_at _heard_at reacquire_id"
     " request_id renewed_at deadline on_reply on_error",
 }
 LEFT_OUT = frozenset(name for names in _LEFT_OUT_BECAUSE.values() for name in names.split())
 """Fields of any record by name."""
+_NAMED = frozenset({str, ProcessKey, Token})
 _PLAIN = frozenset({int, bool, NoneType})
-_NOISE = frozenset({"seq", "epoch", "message", "hint", "details", "instance", "nonce", "pid"})
-"""Of messages."""
 type Names = dict[object, int]
 
 
 def fingerprint(world: World) -> int:
-    """Return 64 bits that tell a world from those that are not the same."""
-    return int.from_bytes(blake2b(canonical(world), digest_size=8).digest())
+    """Return 64 bits that tell a world from those that are not the same, in this process."""
+    return hash(canonical(world))
 
 
 def canonical(world: World) -> bytes:
@@ -95,6 +96,9 @@ class _Part:
         self.moments: list[int] = []
 
     def put(self, *values: Any) -> None:
+        self.put_all(values)
+
+    def put_all(self, values: Iterable[Any]) -> None:
         row, names = self.row, self.names
         for value in values:
             kind = type(value)
@@ -103,11 +107,15 @@ class _Part:
             elif kind is float:
                 self.moments.append(len(row))
                 row.append(value)
-            elif kind is str:
+            elif kind in _NAMED:
                 named = names.get(value)
-                if named is None and value[:1] == "L" and value[1:2].isdigit():
-                    named = self.name(value)  # a lease
+                if named is None and (
+                    kind is not str or (value[:1] == "L" and value[1:2].isdigit())
+                ):
+                    named = names[value] = len(names) + 1
                 row.append(value if named is None else named)
+            elif not value:
+                row.append(0)
             else:
                 _WRITERS[kind](self, value)
 
@@ -142,23 +150,23 @@ _WRITERS = _Writers()
 def _writer(kind: type) -> _Writer:
     if issubclass(kind, Enum):
         return lambda part, value: part.row.append(value._value_)
-    if kind in (ProcessKey, Token):
-        return lambda part, value: part.row.append(part.name(value))
+    if issubclass(kind, Refusal):
+        return lambda part, value: part.put(value.code)
     if kind is LeaseSpec:
         return lambda part, value: part.row.append(value.consumer)
     if issubclass(kind, dict):
         return _write_table
     if issubclass(kind, set | frozenset):
-        return lambda part, some: part.put(len(some), *_sorted(part, some))
+        return lambda part, some: part.put_all((len(some), *_sorted(part, some)))
     if issubclass(kind, list | tuple | deque):
-        return lambda part, some: part.put(len(some), *some)
+        return lambda part, some: part.put_all((len(some), *some))
     return _record_writer()
 
 
 def _write_table(part: _Part, table: dict[Any, Any]) -> None:
     part.row.append(len(table))
     for key in _sorted(part, table):
-        part.put(key, table[key])
+        part.put_all((key, table[key]))
 
 
 def _sorted(part: _Part, keys: Any) -> Any:
@@ -166,15 +174,30 @@ def _sorted(part: _Part, keys: Any) -> Any:
 
 
 def _record_writer() -> _Writer:
-    getters: list[Callable[[Any], Any]] = []  # made with the first value: it knows its fields
+    getter: Callable[[Any], Any] | None = None  # made with the first value: it knows its fields
 
     def write(part: _Part, value: Any) -> None:
-        if not getters:
-            every = [one.name for one in fields(value)] if is_dataclass(value) else vars(value)
-            getters.extend(attrgetter(name) for name in every if name not in LEFT_OUT)
-        part.put(*[get(value) for get in getters])
+        nonlocal getter
+        if getter is None:
+            names = list(_fields(value))
+            # the module fills up: a getter of one name returns no tuple
+            getter = attrgetter(*names, *["__module__"] * (2 - len(names)))
+        part.put_all(getter(value))
 
     return write
+
+
+def _fields(record: Any) -> Iterator[str]:
+    """Yield the names of what is written of a record, and of the records that it always has."""
+    hints = {one.name: one.type for one in fields(record)} if is_dataclass(record) else {}
+    for name in hints or vars(record):
+        if name in LEFT_OUT:
+            continue
+        inner = getattr(record, name)
+        if is_dataclass(inner) and hints.get(name) is type(inner):
+            yield from (f"{name}.{one}" for one in _fields(inner))
+        else:
+            yield name
 
 
 # -- the parts of a world
@@ -184,29 +207,15 @@ def _client(core: Core, client: Client, names: Names) -> _Part:
     for number in (client.awaited, connection._handshake_id):
         part.put(part.name((client.process, number)))
     for number, pending in connection._pending.items():
-        part.put(part.name((client.process, number)), pending)
+        part.put_all((part.name((client.process, number)), pending))
         part.put(pending.request.TAG[1], pending.request)
-    for message in (*client.up, {"": ""}, *client.down):
-        _message(part, client, message)
+    for mail in (client.up, client.down):
+        part.put(len(mail))
+        for re, body in mail:
+            part.put(re and part.name((client.process, re)), type(body).__name__, body)
     mine = {id: nonce for (process, nonce), id in core.nonces.items() if process == client.process}
     part.put(mine)
     return part
-
-
-def _message(part: _Part, client: Client, message: Mapping[str, Any]) -> None:
-    """A message without its numbers and times."""
-    for key, value in sorted(message.items()):
-        if key in _NOISE or isinstance(value, float):
-            continue
-        if key in ("id", "re"):
-            part.put(part.name((client.process, value)))
-        elif key == "token" and value is not None:
-            part.put(Token(*value))
-        elif isinstance(value, dict | list):
-            for one in value if isinstance(value, list) else [value]:
-                _message(part, client, one if isinstance(one, dict) else {"": one})
-        else:
-            part.put(key, value)
 
 
 def _gpu(core: Core, gpu: Gpu, device: Device, names: Names) -> _Part:

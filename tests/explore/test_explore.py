@@ -1,6 +1,8 @@
 """The explorer itself: a tiny world to its end, a seeded defect by its shortest story, and which
 worlds count as the same."""
 
+import random
+
 import pytest
 
 from tests.explore.client import Broken
@@ -8,7 +10,7 @@ from tests.explore.cloning import Freezer, thaw
 from tests.explore.fingerprint import canonical, fingerprint
 from tests.explore.scenarios import BIG, HELD, TALKS, kind
 from tests.explore.search import Search, play
-from tests.explore.world import CAPACITY_BYTES, OVERHEAD_BYTES, STEP_S, Scenario, story
+from tests.explore.world import CAPACITY_BYTES, OVERHEAD_BYTES, STEP_S, Scenario, World, story
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect
 from vram_arbiter.arbiter.core.events import Asked, Event, MemorySampled, ProbeFailed
@@ -71,7 +73,22 @@ def test_a_waiter_that_no_path_serves_is_found() -> None:
     report = Search(Scenario("blind", (BIG,), engine=Blind)).run(60.0)
     assert report.error
     assert report.story == story("acquire a")
-    assert report.error == "no path serves those that wait"
+    assert report.error == "a client waits for ever"
+
+
+def test_a_deadline_that_comes_again_and_again_hides_no_other_one() -> None:
+    """The graph knew a client's ping alone of two deadlines, never the reading that grants, and said
+    that no path serves the other client."""
+    after = (
+        "acquire a, send a, hear a, load a, ready a, send a, drop a, sleep, "
+        "acquire b, send b, hear b, sleep, sleep"
+    )
+    late = Scenario("late", (TALKS, TALKS), after=after, talks=True)
+    report = Search(late).run(60.0)
+    assert not report.error, report
+    assert report.complete
+    assert report.served
+    assert report.unproven == 0
 
 
 # -- copies
@@ -79,14 +96,28 @@ def test_a_waiter_that_no_path_serves_is_found() -> None:
 def test_a_copy_is_the_same_world_and_another(scenario: Scenario) -> None:
     world = play(scenario, story("acquire a, acquire b"))
     freezer, before = Freezer(), canonical(world)
-    frozen = [freezer.freeze(world) for _ in range(3)]  # each with more words than the one before
-    assert [canonical(thaw(one)) for one in frozen] == [before] * 3
-    copy = thaw(frozen[0])
+    frozen = [
+        freezer.freeze(world, {}) for _ in range(3)
+    ]  # each with more words than the one before
+    assert [canonical(thaw(one, World(scenario))) for one in frozen] == [before] * 3
+    copy = thaw(frozen[0], World(scenario))
     while copy.clients["a"].has_mail() or copy.clients["b"].has_mail():
         copy.act(next(action for action in copy.actions() if action[0] in ("send", "hear")))
     copy.act(next(action for action in copy.actions() if action[0] == "load"))
     assert canonical(copy) != before
     assert canonical(world) == before
+
+
+@pytest.mark.parametrize("scenario", [TWO, TALK], ids=lambda one: one.name)
+def test_what_an_action_does_not_touch_stays(scenario: Scenario) -> None:
+    world, chance = World(scenario), random.Random(0)
+    for _ in range(60):
+        action = chance.choice(thaw(Freezer().freeze(world, {}), world).actions())
+        before = Freezer().freeze(world, {})
+        world.act(action)
+        after = Freezer().freeze(world, {})
+        for name in before.keys() - world.touched:
+            assert after[name][:2] == before[name][:2], name
 
 
 # -- which worlds are the same

@@ -51,6 +51,7 @@ LIES: Mapping[str, int] = {"nothing": 0, "everything": CAPACITY_BYTES, "nonsense
 """Bytes that a lying reading shows as used."""
 FAULTS = frozenset({"cancel", "crash", "drop", "fail", "late", "lie", "restart"})
 """Verbs that happen only where a scenario allows it, and so often."""
+REST = "rest"
 _PERIODIC = ("probe", "verify", "revoke")
 
 type Action = tuple[str, str]
@@ -144,6 +145,8 @@ class World:
     engine: Arbiter
 
     def __init__(self, scenario: Scenario) -> None:
+        self.origin: Mapping[str, object] = {}  # what its parts were thawed from
+        self.touched = set[str]()  # parts that may have changed since then
         self.scenario, self.left = scenario, dict(scenario.faults)
         self.now, self.epoch = START_S, 0
         gpus = [info.id for info in _settings(scenario.gpus, 1).gpus]
@@ -163,6 +166,21 @@ class World:
             self._deliver(mail=True, readings=True)
         for action in story(scenario.after):
             self.act(action)
+
+    # -- its parts
+    def parts(self) -> dict[str, Any]:
+        """Return what shares nothing that changes: the engine, each client, the rest."""
+        apart = ("engine", "clients", "origin", "touched")
+        rest = {name: value for name, value in vars(self).items() if name not in apart}
+        return {REST: rest, "engine": self.engine, **self.clients}
+
+    def put_back(self, name: str, part: Any) -> None:
+        if name == REST:
+            vars(self).update(part)
+        elif name == "engine":
+            self.engine = part
+        else:
+            self.clients[name] = part
 
     # -- what may happen
     def actions(self) -> list[Action]:
@@ -185,6 +203,7 @@ class World:
     def act(self, action: Action) -> None:
         """Let something happen. Raises what must not be raised."""
         verb, whose = action
+        self.touched.add(REST)
         if verb in self.left:
             self.left[verb] -= 1
         if whose in self.clients:
@@ -192,7 +211,8 @@ class World:
         else:
             getattr(self, f"do_{verb}")(*whose.split())
         self._deliver(mail=not self.scenario.talks, readings=self.scenario.talks)
-        check_arbiter(self.engine)
+        if "engine" in self.touched:
+            check_arbiter(self.engine)
         self._check(state_of(self.engine))
 
     def _deliver(self, *, mail: bool, readings: bool) -> None:
@@ -211,6 +231,7 @@ class World:
     def post(self, event: ev.Event) -> None:
         """Hand an event to the engine and perform what it asks, as the executor does."""
         self.now += STEP_S
+        self.touched.add("engine")
         effects = self.engine.handle(event, self.now)
         for effect in effects:
             match effect:
@@ -234,7 +255,8 @@ class World:
     def _tell(self, to: ClientId, told: Told, re: RequestId | None) -> None:
         client = self.clients.get(to.partition("-")[0])
         if client is not None and client.client == to:
-            client.tell(told, re, self.epoch)
+            self.touched.add(client.name)
+            client.down.append((re, told))
 
     def hold(self, process: ProcessKey, gpu: GpuId, count: int) -> None:
         """A process holds so many bytes on a GPU from now on."""
@@ -255,6 +277,7 @@ class World:
         for device in self.devices.values():
             device.reading, device.again = None, False
         for client in self.clients.values():
+            self.touched.add(client.name)
             client.cut_off()
         records = dict(self.journal)
         self.post(ev.Recovered(records) if records else ev.Tick())
@@ -332,7 +355,7 @@ class World:
             if self.now > device.freed_at + LAG_S:
                 device.late.clear()
         for client in self.clients.values():
-            client.tick(self.now)
+            client.tick(self)
         due = self.engine.next_deadline()
         if due is not None and due <= self.now:
             self.post(ev.Tick())
