@@ -18,6 +18,7 @@ from typing import Any
 import msgpack
 
 from tests.support.full_check import check_arbiter
+from tests.support.typed import mistyped
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import (
     Effect,
@@ -44,6 +45,7 @@ from vram_arbiter.arbiter.core.events import (
     Tick,
 )
 from vram_arbiter.arbiter.core.model.refusals import NotJournaled
+from vram_arbiter.arbiter.core.model.state import Inspection
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.arbiter.host.records import records_of
 from vram_arbiter.arbiter.rpc import words
@@ -52,6 +54,7 @@ from vram_arbiter.schemas.codec import from_map, to_map
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.errors import ErrorView
+from vram_arbiter.schemas.wire.notes import OperatorNote, RefusedNote
 from vram_arbiter.schemas.wire.replies import AcquireReply
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
@@ -177,7 +180,7 @@ class CoreDriver:
         self.events.append((self.now, event))
         effects = self.arbiter.handle(event, self.now)
         check_arbiter(self.arbiter)
-        _well_formed(effects)
+        _well_formed(event, effects, self.arbiter.inspect())
         failed: list[JournalPut] = []
         held_back: list[JournalPut] = []
         performed: list[Effect] = []
@@ -301,6 +304,7 @@ class CoreDriver:
         """The status as the wire shows it."""
         page: Any = None if after is None else tuple(after)
         told = self.arbiter.status(self.now, reader, page, limit, details=details)
+        _well_typed(told)
         return as_wire(words.reply(told))
 
     def blocked(self, index: int = 0) -> str:
@@ -310,7 +314,9 @@ class CoreDriver:
 
     def why(self, consumer: str) -> dict[str, Any]:
         """The answer to `why` as the wire shows it, with its words."""
-        return as_wire(words.reply(self.arbiter.why(consumer, self.now)))
+        told = self.arbiter.why(consumer, self.now)
+        _well_typed(told)
+        return as_wire(words.reply(told))
 
     def state(self, lease: LeaseId) -> str:
         """The state of a lease; "over" once it has none."""
@@ -584,11 +590,41 @@ def answer(effects: Sequence[Effect]) -> Mapping[str, Any]:
     return as_wire(words.reply(found[0].body))
 
 
-def _well_formed(effects: Sequence[Effect]) -> None:
-    """Answers name their request. Raises AssertionError."""
-    for effect in effects:
-        if isinstance(effect, Reply | Refuse) and not isinstance(effect.request, int):
-            raise AssertionError(f"an answer to nothing: {effect}")
+NOT_OF_A_LEASE = frozenset(
+    [
+        "pressure",
+        "stowaway",
+        "probe_failed",
+        "probe_ok",
+        "journal_failed",
+        "recovered",
+        "serving",
+        "resumed",
+    ]
+)
+"""Kinds of notes that are about a GPU or the daemon."""
+
+
+def _well_formed(event: Event, effects: Sequence[Effect], state: Inspection) -> None:
+    """Every request has its one answer, notes name their lease, and every field of an effect, and of
+    the leases that notes are about, is of its type. Raises AssertionError."""
+    asked = [(event.client, event.id)] if isinstance(event, Asked) else []
+    answered = [(e.client, e.request) for e in effects if isinstance(e, Reply | Refuse)]
+    if answered != asked:
+        raise AssertionError(f"{asked} asked, {answered} answered: {effects}")
+    for note in (e for e in effects if isinstance(e, Note)):
+        may_be_either = isinstance(note.body, OperatorNote | RefusedNote)
+        if not may_be_either and (note.about is None) != (note.kind in NOT_OF_A_LEASE):
+            raise AssertionError(f"about another thing: {note}")
+    abouts = [e.about for e in effects if isinstance(e, Note) and e.about is not None]
+    told = {about.lease_id for about in abouts if about.lease_id is not None}
+    known = [table[lease] for table in (state.leases, state.ended) for lease in told & table.keys()]
+    _well_typed(*effects, *known)
+
+
+def _well_typed(*told: object) -> None:
+    if odd := next(filter(None, map(mistyped, told)), ""):
+        raise AssertionError(f"not of its type: {odd}")
 
 
 def _names(effect: Effect, lease: str) -> bool:

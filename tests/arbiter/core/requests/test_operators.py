@@ -15,6 +15,7 @@ from vram_arbiter.arbiter.rpc import words
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.wire.notes import OperatorNote
 
 BY = "ops (uid 0, pid 7)"
 
@@ -31,6 +32,12 @@ def order_of(ops: Consumer, action: Any, target: str = "", reason: str = "test")
 def noted(effects: list[Effect]) -> dict[str, Any]:
     (note,) = [e for e in effects if isinstance(e, Note) and e.kind == "operator"]
     return words.event(note)
+
+
+def orders(effects: list[Effect]) -> list[OperatorNote]:
+    """What the history says of orders."""
+    notes = [e for e in effects if isinstance(e, Note)]
+    return [note.body for note in notes if isinstance(note.body, OperatorNote)]
 
 
 # -- evict
@@ -262,8 +269,12 @@ def test_the_lease_of_a_silent_holder_is_given_up_and_its_bytes_measured(
     refused = refusal(order_of(ops, "release_dead", lease))
     assert "not dead" in refused.message
     driver.advance(450.0)
-    assert answer(order_of(ops, "release_dead", lease, "hangs since noon"))["state"] == "expired"
-    assert driver.notes("operator")[-1]["action"] == "release_dead"
+    effects = order_of(ops, "release_dead", lease, "hangs since noon")
+    assert answer(effects)["state"] == "expired"
+    silent_s = pytest.approx(450.01)
+    assert orders(effects) == [
+        OperatorNote("release_dead", BY, "hangs since noon", silent_s=silent_s)
+    ]
     assert driver.notes("expired")[-1]["why"] == "given_up"
     (lost,) = driver.pushes("lost", lease)
     assert lost["error"]["code"] == "lease_expired"
@@ -420,3 +431,30 @@ def test_what_holds_nothing_is_not_killed(driver: CoreDriver, ops: Consumer) -> 
 def test_a_changed_setting_leaves_the_others_as_they_are(driver: CoreDriver) -> None:
     driver.post(SettingsChanged({"waiters_max": 3}))
     assert state_of(driver.arbiter).settings == replace(driver.settings, waiters_max=3)
+
+
+def test_the_history_names_each_order_with_who_and_why(driver: CoreDriver, ops: Consumer) -> None:
+    det, asleep = held(driver, "det", 5, standby=True)
+    person = driver.consumer("policy")
+    lease = person.acquire(5 * GIB)
+    det.unload(asleep)
+    driver.until(lambda: driver.state(lease) == "loading")
+    person.load(lease)
+    person.use_begin(lease)
+    given = [("pin", lease), ("unpin", lease), ("evict", lease), ("evict", lease)]
+    given += [("evict", asleep), ("drain", ""), ("resume", "")]
+    told = [
+        note
+        for action, target in given
+        for note in orders(order_of(ops, action, target, f"{action} it"))
+    ]
+    assert told == [
+        OperatorNote("pin", BY, "pin it"),
+        OperatorNote("unpin", BY, "unpin it"),
+        OperatorNote("evict", BY, "evict it", uses=1),
+        OperatorNote("evict", BY, "evict it", repeated=True),
+        OperatorNote("evict", BY, "evict it"),
+        OperatorNote("drain", BY, "drain it"),
+        OperatorNote("resume", BY, "resume it"),
+    ]
+    assert driver.state(asleep) == "over"
