@@ -3,6 +3,8 @@ nobody is granted before."""
 
 from typing import Any
 
+import pytest
+
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.scenes import give_back, why
 from vram_arbiter.arbiter.core.effects import Note, Push
@@ -362,6 +364,46 @@ def test_a_lost_journal_believes_holders_for_a_while(driver: CoreDriver) -> None
     assert driver.state(lease) == "revoking"
     assert driver.state(waiter) == "queued"
     assert f"lease:{lease}" in driver.journal
+
+
+@pytest.mark.parametrize(
+    ("how", "kept"),
+    [
+        (
+            {"held": True, "measured_bytes": 4 * GIB},
+            {"state": "held", "gpu": "GPU-0", "charge_bytes": 4 * GIB, "measured_bytes": 4 * GIB},
+        ),
+        ({"held": False}, {"state": "loading", "gpu": "GPU-0", "charge_bytes": 5 * GIB}),
+        ({"away": True}, {"state": "standby", "comes_back": True}),
+        (
+            {"parked": True},
+            {"state": "parked", "comes_back": True, "parks": True, "parked_bytes": GIB},
+        ),
+    ],
+    ids=lambda value: next(iter(value)),
+)
+def test_the_journal_takes_an_adopted_lease_as_its_holder_tells(
+    driver: CoreDriver, how: dict[str, Any], kept: dict[str, Any]
+) -> None:
+    driver.device.overhead_bytes = 100 * MIB  # what nobody has told of yet: the engine recovers
+    det = driver.consumer("det")
+    det.hold(3 * GIB)
+    driver.restart(keep_journal=False)
+    det.connect()
+    spec = det.spec(5 * GIB, 3 * GIB, standby=True, park_bytes=GIB)
+    answer(det.reattach(LeaseId("L1-50"), Token(1, 50), spec=spec, **how))
+    record = driver.journal["lease:L1-50"]
+    unlike = {"spec", "nonce", "pid", "start_ticks", "held_from"}
+    usual = {
+        "lease_id": "L1-50",
+        "token": [1, 50],
+        "gpu": None,
+        "charge_bytes": 0,
+        "load_peak_bytes": 5 * GIB,
+        "measured_bytes": None,
+        "exiting": False,
+    }
+    assert {key: value for key, value in record.items() if key not in unlike} == usual | kept
 
 
 def test_adopting_more_than_the_gpu_has_is_pressure_not_a_crash(driver: CoreDriver) -> None:
