@@ -117,8 +117,9 @@ class Departure:
         self._left: anyio.Event | None = None  # set when `_leave` returns; None: it was not started
 
     def enter(self, use_id: str) -> bool:
-        """Note a use. Returns whether it keeps the lease. Any thread may call: `asked` is read after
-        the use is noted, and set before `_leave` looks for uses, so that one sees the other."""
+        """Note a use. Returns whether it keeps the lease. Any thread may call: `asked` is read
+        after the use is noted, and set before `_leave` looks for uses, so that one sees the other.
+        """
         self.uses.add(use_id)
         return not self.asked
 

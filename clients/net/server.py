@@ -143,8 +143,8 @@ class RouterServer:
     A handler runs in a task of its own, so that a slow one delays no other request; its work up to
     the first wait is done at once.
     Args: `message_max_bytes` bounds one request; beside binary values, as pictures are, it holds at
-    most 1 MiB. `work_share` as in `schemas.runtime.connection.Bounds`. `closed_to`: a Unix group whose
-    members are answered NotPermitted, None: there is none.
+    most 1 MiB. `work_share` as in `schemas.runtime.connection.Bounds`. `closed_to`: a Unix group
+    whose members are answered NotPermitted, None: there is none.
     Raises ConfigError for an endpoint that cannot be bound, AlreadyRunning when a living server has
     it.
     """

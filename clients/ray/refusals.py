@@ -1,13 +1,14 @@
-"""What a fleet refuses, by name: clusters that are open to their network, and GPUs or their bytes as
-resources of Ray. Imports Ray only inside a function.
+"""What a fleet refuses, by name: clusters that are open to their network, and GPUs or their bytes
+as resources of Ray. Imports Ray only inside a function.
 """
 
 import ipaddress
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import wraps
 from typing import Any, Final
 
 from vram_arbiter.schemas.errors import BadRequest, NotPermitted
+from vram_arbiter.schemas.plain import JsonMap
 
 MARKER: Final = "vram_arbiter"
 """The only resource of ours that Ray counts: which nodes have an arbiter."""
@@ -44,7 +45,7 @@ def token_auth() -> bool:
     return bool(is_token_auth_enabled())
 
 
-def refuse_options(options: Mapping[str, Any]) -> None:
+def refuse_options(options: JsonMap) -> None:
     """Raise BadRequest for GPUs or bytes among Ray's options of a leased actor or task."""
     asked = [name for name in ("num_gpus", "accelerator_type") if options.get(name)]
     for name in options.get("resources") or ():

@@ -27,7 +27,7 @@ def give_back_freed_memory() -> None:
 
 @contextmanager
 def without_collections() -> Iterator[None]:
-    """Make objects that all stay: looking for garbage among them is a tenth of the imports' time."""
+    """Make objects that all stay: the search for garbage is a tenth of the imports' time."""
     gc.disable()
     try:
         yield

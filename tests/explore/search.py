@@ -28,8 +28,8 @@ SERVE_STEPS_MAX = 400
 SERVE_SHARE = 0.1
 """Of the time of a search that is cut: for serving those that wait at its edge."""
 COLLECT_EVERY = 20
-"""States between two collections of garbage: worlds hold circles, and memory that was used just now is
-fast."""
+"""States between two collections of garbage: worlds hold circles, and memory that was used just now
+is fast."""
 
 
 @dataclass(slots=True)

@@ -77,8 +77,8 @@ def test_a_waiter_that_no_path_serves_is_found() -> None:
 
 
 def test_a_deadline_that_comes_again_and_again_hides_no_other_one() -> None:
-    """The graph knew a client's ping alone of two deadlines, never the reading that grants, and said
-    that no path serves the other client."""
+    """The graph knew a client's ping alone of two deadlines, never the reading that grants, and
+    said that no path serves the other client."""
     after = (
         "acquire a, send a, hear a, load a, ready a, send a, drop a, sleep, "
         "acquire b, send b, hear b, sleep, sleep"

@@ -1,8 +1,8 @@
 """Parsers of bytes that another user, machine or program wrote, in one table.
 
 A target takes any bytes. It may raise the typed errors that its callers answer; anything else, and
-more processor time than `try_input` allows, is a finding. `corpus/NAME/` has bytes of each target, all
-made here: whole messages, known attacks, and what once broke a target.
+more processor time than `try_input` allows, is a finding. `corpus/NAME/` has bytes of each target,
+all made here: whole messages, known attacks, and what once broke a target.
 """
 
 import functools

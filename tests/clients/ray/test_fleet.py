@@ -164,7 +164,7 @@ def test_a_daemon_is_restarted_under_its_agent(boxes: Boxes, fleet: Fleet) -> No
 
 @raylets
 def test_an_actor_whose_wait_ends_is_placed_on_the_next_box(boxes: Boxes, fleet: Fleet) -> None:
-    """The first box seems evictable, but its holder does not leave; the second is busy until then."""
+    """The first box seems evictable, but its holder stays; the second is busy until then."""
     import ray
 
     first, second = boxes.nodes
