@@ -15,7 +15,7 @@ from vram_arbiter.schemas.ids import LeaseId
 RESIDUE_BYTES = 450 * MIB
 
 
-def begun(driver: CoreDriver) -> dict[str, Any]:
+def under_way(driver: CoreDriver) -> dict[str, Any]:
     """The only verification that is under way, but for its clock."""
     (one,) = state_of(driver.arbiter).gpus[driver.device.gpu].verifications.values()
     clock = ("paced_from", "deadline_at", "next_poll_at", "last_used_bytes")
@@ -55,7 +55,7 @@ def test_what_a_holder_declared_may_stay_only_while_it_lives(
     baseline = state_of(driver.arbiter).gpus[driver.device.gpu].sample
     assert baseline is not None
     how(driver, det, lease)
-    assert begun(driver) == {
+    assert under_way(driver) == {
         "key": lease,
         "process": det.process,
         "lease": lease,
@@ -87,7 +87,7 @@ def test_what_a_dead_process_kept_is_compared_with_the_newest_reading(
     baseline = state_of(driver.arbiter).gpus[driver.device.gpu].sample
     assert baseline is not None
     det.die()
-    assert begun(driver) == {
+    assert under_way(driver) == {
         "key": f"residue:{det.process}",
         "process": det.process,
         "lease": None,
