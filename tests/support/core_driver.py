@@ -600,9 +600,11 @@ NOT_OF_A_LEASE = frozenset(
         "recovered",
         "serving",
         "resumed",
+        "drain",
+        "resume",
     ]
 )
-"""Kinds of notes that are about a GPU or the daemon."""
+"""Kinds of notes, and an operator's orders, that are about a GPU or the daemon."""
 
 
 def _well_formed(event: Event, effects: Sequence[Effect], state: Inspection) -> None:
@@ -613,8 +615,9 @@ def _well_formed(event: Event, effects: Sequence[Effect], state: Inspection) -> 
     if answered != asked:
         raise AssertionError(f"{asked} asked, {answered} answered: {effects}")
     for note in (e for e in effects if isinstance(e, Note)):
-        may_be_either = isinstance(note.body, OperatorNote | RefusedNote)
-        if not may_be_either and (note.about is None) != (note.kind in NOT_OF_A_LEASE):
+        name = note.body.action if isinstance(note.body, OperatorNote) else note.kind
+        may_be_either = isinstance(note.body, RefusedNote)
+        if not may_be_either and (note.about is None) != (name in NOT_OF_A_LEASE):
             raise AssertionError(f"about another thing: {note}")
     abouts = [e.about for e in effects if isinstance(e, Note) and e.about is not None]
     told = {about.lease_id for about in abouts if about.lease_id is not None}
