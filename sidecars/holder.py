@@ -98,7 +98,10 @@ class Holder:
         self._memory.empty_cache()  # waits for the GPU
         began_s = time.perf_counter()
         work()
-        self._memory.empty_cache()
+        if self._memory.torch_device != "cpu":
+            import torch
+
+            torch.cuda.synchronize()
         return time.perf_counter() - began_s
 
     def nf4(self) -> JsonMap:

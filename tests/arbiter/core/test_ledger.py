@@ -129,7 +129,7 @@ def test_a_process_known_by_pid_alone_is_found() -> None:
     books.observe(sample(1.0, 200, (unknown_start, 200)), quiet=True)
     assert books.total_if(joining=[(A, 500)]) == 500
     books.charge(LA, A, 500, 500, 2.0)
-    assert (books.total_bytes(), books.stowaways) == (500, {}), "it is no stowaway from now on"
+    assert (books.total_bytes(), books.stowaways) == (500, {}), "the holder is not a stowaway"
     books.observe(sample(3.0, 600, (unknown_start, 600), (ProcessKey(77, 0), 5)), quiet=True)
     assert books.accounts[A].held_bytes - books.accounts[A].charged_bytes == 100
     assert [s.process.pid for s in books.stowaways.values()] == [77]

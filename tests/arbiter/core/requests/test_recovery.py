@@ -385,7 +385,7 @@ def test_a_lost_journal_believes_holders_for_a_while(driver: CoreDriver) -> None
 def test_the_journal_takes_an_adopted_lease_as_its_holder_tells(
     driver: CoreDriver, how: dict[str, Any], kept: dict[str, Any]
 ) -> None:
-    driver.device.overhead_bytes = 100 * MIB  # what nobody has told of yet: the engine recovers
+    driver.device.overhead_bytes = 100 * MIB  # unexplained, so that the engine recovers
     det = driver.consumer("det")
     det.hold(3 * GIB)
     driver.restart(keep_journal=False)

@@ -190,7 +190,7 @@ OVERDUE: dict[str, Case] = {
     "a stranger took all but the tolerance": (
         DEAD, reading(20, 331, {OTHER: 300, 9: 1}), Others(), contested(0, Culprit(9, "p9", 1)),
     ),
-    "what a holder took by right is no excuse": (
+    "bytes of a holder within its charge do not explain the rest": (
         DEAD, reading(20, 331, {OTHER: 301}), Others(),
         contested(0, Culprit(2, "p2", 1), resolved=False),
     ),
