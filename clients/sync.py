@@ -25,6 +25,7 @@ from types import TracebackType
 from typing import Any, Concatenate, Self
 
 import anyio
+from anyio import WouldBlock
 
 from vram_arbiter.clients import use_context
 from vram_arbiter.clients._protocol import records as r
@@ -237,15 +238,21 @@ class Lease(_Blocking[AsyncLease]):
     def __repr__(self) -> str:
         return repr(self._twin)
 
-    @contextmanager
-    def use(self, label: str = "") -> Iterator["Use"]:
+    def use(self, label: str = "") -> AbstractContextManager["Use"]:
         """Mark a busy interval: the holder is not evicted inside it; see `AsyncLease.use`."""
+        return self._use(label, wait=True)
+
+    @contextmanager
+    def _use(self, label: str, *, wait: bool) -> Iterator["Use"]:
+        """`use`. Raises: WouldBlock without `wait`, where the arbiter has to answer first."""
         use = AsyncUse(self._twin, label)
         try:
             if use._begin_ahead():
                 self._portal.soon(use._tell)
-            else:
+            elif wait:
                 self._portal.call(use._begin)
+            else:
+                raise WouldBlock
             use_context.enter(use.use_id, use.name)
             yield Use(self._portal, use)
         finally:

@@ -20,6 +20,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, Protocol
 
+from anyio import WouldBlock
+
 from vram_arbiter.clients import use_context
 from vram_arbiter.clients.sync import Client, Lease, Use
 from vram_arbiter.schemas.errors import (
@@ -100,10 +102,21 @@ class Residency:
     @contextlib.asynccontextmanager
     async def acall(self, label: str) -> AsyncIterator[None]:
         """`call` for coroutines, on any event loop."""
-        with self._inside(self._join() or await self._entered(label)):
+        with self._inside(self._join() or self._entered_now(label) or await self._entered(label)):
             yield
 
     # -- steps
+    def _entered_now(self, label: str) -> Interval | None:
+        """`_enter` where nothing has to be waited for."""
+        if self._lease is None or not self._entering.acquire(blocking=False):
+            return None
+        try:
+            return self._join() or self._begin(self._lease, label, wait=False)
+        except WouldBlock:
+            return None
+        finally:
+            self._entering.release()
+
     async def _entered(self, label: str) -> Interval:
         """`_enter` in a thread. Where the caller is canceled, what it begins is ended."""
         entering = self._thread.submit(self._enter, label, time.monotonic())
@@ -145,13 +158,13 @@ class Residency:
             while (joined := self._join()) is None:
                 lease = self._loaded()
                 try:
-                    return self._begin(lease, label)
+                    return self._begin(lease, label, wait=True)
                 except LEFT:
                     continue
             return joined
 
-    def _begin(self, lease: Lease, label: str) -> Interval:
-        use, name = lease.use(label), use_context.named(label, lease.lease_id)
+    def _begin(self, lease: Lease, label: str, *, wait: bool) -> Interval:
+        use, name = lease._use(label, wait=wait), use_context.named(label, lease.lease_id)
         self._interval = interval = Interval(use, use.__enter__().use_id, name)
         lease._portal.soon(self._share, interval)
         return interval

@@ -14,8 +14,10 @@ from tests.support.fakegpu_check import check_log
 from tests.support.leases import Spec
 from tests.support.process import ArbiterProcess
 from tests.support.waiting import PATIENCE_S, play, until
+from vram_arbiter.clients import lease
 from vram_arbiter.clients.ray import Refused, idempotent, leased
 from vram_arbiter.clients.ray.refusals import refuse_options
+from vram_arbiter.clients.ray.residency import Residency
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.errors import BadRequest, LeaseRevoking, WaitTimeout
@@ -202,6 +204,23 @@ def test_coroutines_and_one_that_is_canceled_while_it_waits(
 
     play(story)
     until(lambda: model.loads == 2)
+    until(lambda: model.lease.uses == 0)
+
+
+def test_a_coroutine_uses_what_is_loaded_without_a_thread(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The way to a thread and back was most of what a lease added to a coroutine's call."""
+    monkeypatch.setattr(lease, "PAUSE_S", 0.0)
+    model = make()
+
+    async def story() -> None:
+        assert await model.later(1) == 1
+        await asyncio.to_thread(until, lambda: model.lease.uses == 0)
+        monkeypatch.delattr(Residency, "_entered")
+        assert await model.later(2) == 2
+
+    play(story)
     until(lambda: model.lease.uses == 0)
 
 
