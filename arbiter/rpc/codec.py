@@ -77,15 +77,6 @@ def decode(payload: bytes | bytearray | memoryview, size_max: int) -> tuple[Enve
     return Envelope(RequestId(request_id), read), request
 
 
-def id_of(payload: bytes | bytearray | memoryview, size_max: int) -> int | None:
-    """The id that a request is answered to, without looking at the rest of it; None where none can
-    be read."""
-    try:
-        return _id(unpack_map(payload, _limits(size_max)))
-    except VramError:
-        return None
-
-
 @lru_cache(maxsize=8)
 def _limits(size_max: int) -> UnpackLimits:
     return UnpackLimits(message_max_bytes=size_max, keys_max=KEYS_MAX)

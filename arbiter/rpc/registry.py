@@ -102,8 +102,6 @@ class SessionSettings:
     operator_reserve: int
     user_share: float
     process_share: float
-    rate_per_client_per_s: int
-    rate_per_process_per_s: int
     subscribers_max: int
     operators_gid: int | None
     guests_gid: int | None = None

@@ -9,7 +9,7 @@ every limit's breach is a typed reply; no input raises.
 import difflib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.log import RefusalLog
@@ -24,7 +24,7 @@ from vram_arbiter.arbiter.rpc.registry import (
     Watch,
     share_of,
 )
-from vram_arbiter.schemas.defaults import DEMANDS_MAX, KIB, WIRE_VERSION
+from vram_arbiter.schemas.defaults import DEMANDS_MAX, WIRE_VERSION
 from vram_arbiter.schemas.errors import (
     BadRequest,
     BadState,
@@ -55,16 +55,6 @@ from vram_arbiter.schemas.wire.views import DaemonView, DemandView, SensorsView
 
 HISTORY_PAGE = 2000
 """Events in one reply, whatever was asked for: packing more would hold the loop for too long."""
-REFUSED_MAX_BYTES = 64 * KIB
-"""Of a message over the rate the id is read, if it is no larger than this."""
-CHARGE_BYTES = 1024
-"""A request costs one of its rate, and one more for each of these many bytes: its cost grows with
-its size."""
-SKIPPED_CHARGE_BYTES = 64 * 1024
-"""The same for a message over its limit, which was skipped without being kept or decoded."""
-BUDGETS_MAX = 1024
-"""Budgets of processes kept before those that have refilled are forgotten."""
-
 _HOLDING = (w.Acquire, w.Reacquire, w.Reattach, w.UseBegin)
 """Requests that can make the engine remember something of a client beyond its connection."""
 _KINDS = frozenset((*NOTES, *DAEMON_KINDS))
@@ -73,16 +63,6 @@ _KINDS = frozenset((*NOTES, *DAEMON_KINDS))
 HistoryReader = Callable[[int, int, tuple[str, ...], Callable[[HistoryReply], None]], None]
 """`read(after, limit, kinds, done)`: `done` is called on the loop's thread, at once or later, with
 the body of the reply."""
-
-
-@dataclass(slots=True)
-class Budget:
-    """Requests that a connection or a process may still send at once; it refills within one
-    second."""
-
-    rate: float
-    left: float
-    at: float
 
 
 class SessionTable:
@@ -116,60 +96,26 @@ class SessionTable:
         self._registry = Registry(settings, decisions, watch)
         self._sessions = self._registry.sessions
         self._moved = self._registry.moved
-        self._budgets: dict[int, tuple[Budget, Budget]] = {}  # of the connection, its process
-        # they outlive connections: connecting again does not refill them. A process that cannot be
-        # seen has pid 0, whichever it is
-        self._process_budgets: dict[tuple[int, ProcessKey], Budget] = {}
-        self._too_fast = LimitExceeded(
-            f"more than {settings.rate_per_client_per_s} requests a second of one connection, or "
-            f"{settings.rate_per_process_per_s} of one process; "
-            "each KiB of a message counts as one more",
-            hint="send less often",
-            details={
-                "limit": "rate_per_client_per_s",
-                "value": settings.rate_per_client_per_s,
-                "process_value": settings.rate_per_process_per_s,
-            },
-        ).view()
 
     # -- in
     def connected(self, connection: PeerConnection) -> None:
         """A peer has finished the handshake; it is a stranger until its hello."""
-        now, peer = self._clock(), connection.peer
-        shared = self._process_budgets.get((peer.uid, peer.process))
-        if shared is None:
-            if len(self._process_budgets) >= BUDGETS_MAX:
-                for key, budget in list(self._process_budgets.items()):
-                    if budget.left + (now - budget.at) * budget.rate >= budget.rate:
-                        del self._process_budgets[key]
-            rate = float(self._settings.rate_per_process_per_s)
-            shared = Budget(rate, rate, now)
-            self._process_budgets[peer.uid, peer.process] = shared
-        rate = float(self._settings.rate_per_client_per_s)
-        self._budgets[connection.serial] = Budget(rate, rate, now), shared
 
-    def received(self, connection: PeerConnection, payload: bytes | bytearray | Oversize) -> bool:
-        """One message. Never raises for anything that a peer can send. False: its sender is over
-        its rate.
+    def received(self, connection: PeerConnection, payload: bytes | bytearray | Oversize) -> None:
+        """One message. Never raises for anything that a peer can send.
 
-        1. Charge the rate; over it: LimitExceeded, and nothing more is looked at. 2. Decode and
-        validate. 3. Without a session: hello, or UnknownSession. 4. Check the role, and whose the
-        cgroup of a lease is. 5. Answer a read here; everything that can change the engine becomes
-        an event, whose effects answer.
+        1. Decode and validate. 2. Without a session: hello, or UnknownSession. 3. Check the role,
+        and whose the cgroup of a lease is. 4. Answer a read here; everything that can change the
+        engine becomes an event, whose effects answer.
         """
         now, request_id = self._clock(), None
         session = self._sessions.get(ClientId(f"c{connection.serial}"))
-        if not self._charge(connection, payload, now):  # 1
-            if not isinstance(payload, Oversize):
-                request_id = codec.id_of(payload, REFUSED_MAX_BYTES)
-            self._refuse(connection, session, request_id, self._too_fast)
-            return False
         try:
-            if isinstance(payload, Oversize):  # 2
+            if isinstance(payload, Oversize):  # 1
                 raise _too_large(payload, stranger=session is None)
             envelope, request = codec.decode(payload, self._settings.message_max_bytes)
             request_id = envelope.id
-            if session is None:  # 3
+            if session is None:  # 2
                 if not isinstance(request, w.Hello):
                     raise UnknownSession(
                         f"{request.TAG[1]} before hello",
@@ -177,17 +123,17 @@ class SessionTable:
                     )
                 _check_version(request)
                 self._welcome(self._registry.open(connection, request, now), request_id)
-                return True
+                return
             session.heard_at = now
-            roles.check(session.role, request)  # 4
+            roles.check(session.role, request)  # 3
             by = _operator(session, request)
             for spec in _specs(request):
                 if spec.cgroup is not None:
                     known = self._settings.cgroup_root, self._settings.operators_gid
                     check_cgroup(session.peer, spec.cgroup, *known)
-            if isinstance(request, w.SessionRequest):  # 5
+            if isinstance(request, w.SessionRequest):  # 4
                 self._answer(session, request_id, request)
-                return True
+                return
             if not session.leased and isinstance(request, _HOLDING):
                 self._registry.holds(session)
             self._decisions.post(
@@ -197,11 +143,9 @@ class SessionTable:
             self._refuse(connection, session, bad.request_id, bad.error.view())
         except VramError as error:
             self._refuse(connection, session, request_id, error.view())
-        return True
 
     def disconnected(self, connection: PeerConnection, reason: str) -> None:
         """A connection has ended."""
-        del self._budgets[connection.serial]
         self._registry.lost(ClientId(f"c{connection.serial}"))
 
     def sweep(self) -> None:
@@ -241,30 +185,6 @@ class SessionTable:
             self.push(client, EventPush(event))
 
     # -- steps
-    def _charge(
-        self, connection: PeerConnection, payload: bytes | bytearray | Oversize, now: float
-    ) -> bool:
-        """Charge a request to a connection and its process. False: one of them has nothing left,
-        and nothing is charged.
-
-        A request that costs more than what is left goes through, and the next ones wait until that
-        is paid. Processor time of different users is not divided here but by the router's turns: a
-        budget of a user would let some of its processes refuse another.
-        """
-        budgets = self._budgets[connection.serial]
-        for budget in budgets:
-            budget.left = min(budget.rate, budget.left + (now - budget.at) * budget.rate)
-            budget.at = now
-            if budget.left < 1:
-                return False
-        if isinstance(payload, Oversize):
-            cost = 1 + payload.size // SKIPPED_CHARGE_BYTES
-        else:
-            cost = 1 + len(payload) // CHARGE_BYTES
-        for budget in budgets:
-            budget.left -= cost
-        return True
-
     def _refuse(
         self,
         connection: PeerConnection,

@@ -19,7 +19,7 @@ from typing import Final, Self
 
 from pydantic import TypeAdapter, ValidationError
 
-from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MIB, RATE_PER_CLIENT_PER_S
+from vram_arbiter.schemas.defaults import IMAGE_MESSAGE_MAX_BYTES, MIB
 from vram_arbiter.schemas.errors import (
     BadRequest,
     LimitExceeded,
@@ -92,14 +92,6 @@ class _Client:
     connection: Connection
     peer: Peer
     is_guest: bool
-    budget: float = RATE_PER_CLIENT_PER_S  # messages it may send at once
-    counted_at: float = 0.0
-
-    def within_rate(self, now: float) -> bool:
-        rate = float(RATE_PER_CLIENT_PER_S)
-        self.budget = min(rate, self.budget + (now - self.counted_at) * rate) - 1.0
-        self.counted_at = now
-        return self.budget >= 0
 
 
 @dataclass(slots=True)
@@ -177,6 +169,7 @@ class RouterServer:
             out_max_bytes=several_bytes,
             user_out_max_bytes=2 * several_bytes,
             user_in_max_bytes=several_bytes,
+            charge_bytes=message_max_bytes,  # a picture is one message
             work_share=work_share,
         )
         self._router = Router(self._path, self, limits)
@@ -235,9 +228,8 @@ class RouterServer:
     def disconnected(self, connection: Connection, reason: str) -> None:
         del self._clients[connection.serial]
 
-    def received(self, connection: Connection, payload: bytes | bytearray | Oversize) -> bool:
+    def received(self, connection: Connection, payload: bytes | bytearray | Oversize) -> None:
         client, loop = self._clients[connection.serial], asyncio.get_running_loop()
-        within_rate = client.within_rate(loop.time())
         try:
             if client.is_guest:
                 raise NotPermitted(
@@ -248,7 +240,7 @@ class RouterServer:
             waiting = self._waiting_of(client.peer.uid, size)
         except VramError as error:
             connection.send(pack(self._refusal(payload, error)))
-            return within_rate
+            return
         if not connection.admitted:
             connection.admit()
         waiting.count += 1
@@ -261,7 +253,6 @@ class RouterServer:
         if not task.done():
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
-        return within_rate
 
     def _refusal(self, payload: bytes | bytearray | Oversize, error: VramError) -> Message:
         """Return the answer to a message that is not handled, with the id where it begins with

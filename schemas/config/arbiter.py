@@ -163,7 +163,8 @@ class LimitsConfig(_Section):
     """Uses of one lease at a time: its holder's own, and as many of others."""
     rate_per_client_per_s: Annotated[int, Field(ge=10, le=1_000_000)] = d.RATE_PER_CLIENT_PER_S
     """Requests a second of one connection; a burst of one second's worth is allowed. Each KiB of a
-    request counts as one more."""
+    request counts as one more. Beyond it the connection is read more slowly, and nothing is
+    lost."""
     rate_per_process_per_s: Annotated[int, Field(ge=10, le=1_000_000)] = d.RATE_PER_PROCESS_PER_S
     """The same for all connections of one process together."""
     subscribers_max: Annotated[int, Field(ge=0, le=65_536)] = d.SUBSCRIBERS_MAX

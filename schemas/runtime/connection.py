@@ -8,8 +8,15 @@ import logging
 from dataclasses import dataclass
 from typing import Protocol
 
-from vram_arbiter.schemas.defaults import KIB, MESSAGE_MAX_BYTES, MIB
+from vram_arbiter.schemas.defaults import (
+    KIB,
+    MESSAGE_MAX_BYTES,
+    MIB,
+    RATE_PER_CLIENT_PER_S,
+    RATE_PER_PROCESS_PER_S,
+)
 from vram_arbiter.schemas.runtime.peercred import Peer
+from vram_arbiter.schemas.runtime.rate import Rate
 from vram_arbiter.schemas.runtime.zmtp import (
     Heartbeat,
     Message,
@@ -23,12 +30,12 @@ from vram_arbiter.schemas.runtime.zmtp import (
 
 log = logging.getLogger(__name__)
 
-REST_S = 0.005
-"""A connection that is over its rate is not read for this long; its sender's buffer then fills."""
 READ_AHEAD_BYTES = 16 * KIB
 """Unread bytes from which on a connection that waits for its turn is not read any further."""
 OUT_MESSAGES_MAX = 4096
 """Messages queued for a peer that does not read."""
+SKIPPED_SHARE = 64
+"""Bytes that are skipped cost so many times less than bytes that are decoded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +57,12 @@ class Bounds:
     """Largest share of the connections that one user may have."""
     process_share: float = 0.25
     """Largest share of the connections that one process may have."""
+    rate_per_client_per_s: float = RATE_PER_CLIENT_PER_S
+    """Messages of one connection. Over its rate it is not read for so long; nothing is lost."""
+    rate_per_process_per_s: float = RATE_PER_PROCESS_PER_S
+    """The same for all connections of one process together."""
+    charge_bytes: int = KIB
+    """A message counts as one, and as one more for each of these many bytes."""
     out_max_bytes: int = 4 * MIB
     """Queued for one connection that does not read."""
     user_out_max_bytes: int = 64 * MIB
@@ -70,10 +83,8 @@ class Handler(Protocol):
     def connected(self, connection: "Connection") -> None:
         """A peer has finished the handshake."""
 
-    def received(self, connection: "Connection", payload: bytes | bytearray | Oversize) -> bool:
-        """One message came; `Oversize` where it was skipped. Return False if its sender is over its
-        rate.
-        """
+    def received(self, connection: "Connection", payload: bytes | bytearray | Oversize) -> None:
+        """One message came; `Oversize` where it was skipped."""
 
     def disconnected(self, connection: "Connection", reason: str) -> None:
         """A connection of which `connected` was told has ended."""
@@ -100,6 +111,7 @@ class Server(Protocol):
     def readable(self, connection: "Connection") -> None: ...
     def lost(self, connection: "Connection", reason: str) -> None: ...
     def complain(self, problem: str) -> None: ...
+    def slowed(self, connection: "Connection") -> None: ...
 
 
 class Connection(asyncio.Protocol):
@@ -107,7 +119,9 @@ class Connection(asyncio.Protocol):
     ignored.
     """
 
-    def __init__(self, router: Server, serial: int, peer: Peer, user: User, now: float) -> None:
+    def __init__(
+        self, router: Server, serial: int, peer: Peer, user: User, process_rate: Rate, now: float
+    ) -> None:
         self.serial = serial
         self.peer = peer
         self.accepted_at = now
@@ -118,6 +132,8 @@ class Connection(asyncio.Protocol):
         self._user = user
         self._transport: asyncio.Transport | None = None
         limits = router.limits
+        rate = float(limits.rate_per_client_per_s)
+        self._rates = Rate(rate, rate, now), process_rate
         self._wire = ServerConnection(
             WireLimits(limits.stranger_message_max_bytes, limits.skip_max_bytes)
         )
@@ -232,7 +248,7 @@ class Connection(asyncio.Protocol):
         1. The next event, unless the peer is over its rate or does not read. 2. Its handler; one
         bad message must not cost the others their server. 3. Bytes kept, and reading on.
         """
-        wire, event, within_rate = self._wire, None, True
+        wire, event = self._wire, None
         try:
             if not (self._resting or self._clogged or self._finishing):
                 event = wire.next_event()  # 1
@@ -246,18 +262,17 @@ class Connection(asyncio.Protocol):
                 case Message() | Oversize() if self._router.receiving:
                     self.envelope = event.envelope
                     payload = event.payload if isinstance(event, Message) else event
-                    within_rate = self._router.handler.received(self, payload)
+                    self._charge(self._cost(payload))
+                    self._router.handler.received(self, payload)
                 case PeerReady():
                     self._flush_wire()
                     self.ready = True
+                    self._charge(0)  # its process may owe some
                     self._router.handler.connected(self)
                 case Heartbeat() | None:
                     self._flush_wire()
         except Exception:
             log.exception("a message of %r could not be handled", self)
-        if not within_rate:
-            self._resting = True
-            self._router.loop.call_later(REST_S, self._rested)
         if wire.kept_bytes != self._in_bytes:  # 3
             self._count_in()
         if self.ended:
@@ -266,6 +281,23 @@ class Connection(asyncio.Protocol):
             self.update_reading()
         stopped = self._resting or self._clogged or self._finishing
         return event is not None and wire.unread_bytes > 0 and not stopped
+
+    def _cost(self, payload: bytes | bytearray | Oversize) -> int:
+        each = self._router.limits.charge_bytes
+        if isinstance(payload, Oversize):
+            return 1 + payload.size // (SKIPPED_SHARE * each)
+        return 1 + len(payload) // each
+
+    def _charge(self, cost: int) -> None:
+        """Charge the connection and its process, and handle nothing more until both may send
+        again."""
+        loop = self._router.loop
+        now = loop.time()
+        rest_s = max([rate.charge(cost, now) for rate in self._rates])
+        if rest_s > 0:
+            self._resting = True
+            self._router.slowed(self)
+            loop.call_later(rest_s, self._rested)
 
     def _rested(self) -> None:
         self._resting = False

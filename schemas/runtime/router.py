@@ -21,6 +21,7 @@ from pathlib import Path
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime.connection import Bounds, Connection, Handler, User
 from vram_arbiter.schemas.runtime.peercred import Peer, PeerGone, identify
+from vram_arbiter.schemas.runtime.rate import Rate
 from vram_arbiter.schemas.runtime.socket_file import SocketFile
 from vram_arbiter.schemas.runtime.turns import Turns
 
@@ -73,6 +74,11 @@ class Router:
         self._strangers: dict[Connection, None] = {}  # not admitted, the oldest first
         self._users: dict[int, User] = {}
         self._processes: dict[ProcessKey, _Process] = {}
+        # they outlive connections: connecting again does not refill them. A process that cannot be
+        # seen has pid 0, whichever it is
+        self._rates: dict[tuple[int, ProcessKey], Rate] = {}
+        self._slow = set[ProcessKey]()  # over their rate since the last sweep
+        self._slow_before = set[ProcessKey]()
         self._turns: Turns[Connection] = Turns()
         self._turn_scheduled = False
         self._complaints = 0
@@ -232,7 +238,9 @@ class Router:
         user = self._users.setdefault(peer.uid, User())
         user.connections += 1
         self._serial += 1
-        connection = Connection(self, self._serial, peer, user, self.loop.time())
+        now, per_s = self.loop.time(), float(self.limits.rate_per_process_per_s)
+        rate = self._rates.setdefault((peer.uid, peer.process), Rate(per_s, per_s, now))
+        connection = Connection(self, self._serial, peer, user, rate, now)
         process.connections.add(connection)
         self._connections.add(connection)
         self._strangers[connection] = None
@@ -329,6 +337,9 @@ class Router:
         if self._complaints == 1:
             log.warning("refused %s", what)
 
+    def slowed(self, connection: Connection) -> None:
+        self._slow.add(connection.peer.process)
+
     # -- watching
     def _sweep_once(self) -> None:
         loop = self.loop
@@ -336,6 +347,7 @@ class Router:
         if self._complaints > 1:
             log.warning("refused %d more connections within %g s", self._complaints - 1, SWEEP_S)
         self._complaints = 0
+        self._watch_rates(now)
         for connection in list(self._strangers):
             age = now - connection.accepted_at
             if age < self.limits.handshake_s:
@@ -346,6 +358,16 @@ class Router:
                 connection.cut("no hello in time")
         self._restore_file()
         self._sweep = loop.call_later(SWEEP_S, self._sweep_once)
+
+    def _watch_rates(self, now: float) -> None:
+        """Log the processes that are over their rate, each once, and forget the rates of those that
+        are gone and owe nothing."""
+        if fresh := self._slow - self._slow_before:
+            log.warning("over their rate, and read more slowly: processes %s", sorted(fresh))
+        self._slow_before, self._slow = self._slow, set()
+        for key, rate in list(self._rates.items()):
+            if key[1] not in self._processes and rate.is_full(now):
+                del self._rates[key]
 
     def _restore_file(self) -> None:
         """Listen again where the socket's file was deleted: without it no client finds the

@@ -121,8 +121,7 @@ def make_bench(**changes: Any) -> Bench:
         "epoch": 3, "boot_id": "boot", "server": "test", "heartbeat_s": 2.0, "fence_grace_s": 5.0,
         "message_max_bytes": 4096,
         "sessions_max": 3, "processes_max": 1000, "operator_reserve": 0, "user_share": 1.0,
-        "process_share": 1.0, "rate_per_client_per_s": 100,
-        "rate_per_process_per_s": 1000, "subscribers_max": 1, "operators_gid": None,
+        "process_share": 1.0, "subscribers_max": 1, "operators_gid": None,
     }  # fmt: skip
     session_bench = Bench()
     settings = SessionSettings(**{**values, **changes})

@@ -149,8 +149,7 @@ class Plant:
         self.watched: set[ProcessKey] = set()
         values: dict[str, Any] = {
             "sessions_max": 50,
-            "processes_max": 1000, "rate_per_client_per_s": 1_000_000,
-            "rate_per_process_per_s": 1_000_000, "subscribers_max": 3,
+            "processes_max": 1000, "subscribers_max": 3,
             "operator_reserve": 0, "user_share": 1.0, "process_share": 1.0, **limits,
         }  # fmt: skip
         settings_ = SessionSettings(
@@ -220,7 +219,6 @@ class Plant:
         """Everything that the table remembers of somebody."""
         registry = self.table._registry
         tables: dict[str, Sized] = {
-            "budgets": self.table._budgets,
             "sessions": registry.sessions,
             "subscribers": registry.subscribers,
             "moved": registry.moved,

@@ -338,83 +338,11 @@ def test_the_same_instance_of_another_process_is_another_client(session_bench: B
 
 
 # -- shares
-def test_the_rate_is_limited_per_session_and_refills(session_bench: Bench) -> None:
-    session_bench.hello(b"a")
-    session_bench.hello(b"b")
-    replies = [session_bench.ask("ping") for _ in range(150)]
-    refused = [reply for reply in replies if not reply["ok"]]
-    assert len(refused) == 51  # a hundred a second, the hello was one of them
-    assert code(refused[0]) == "limit_exceeded"
-    assert refused[0]["error"]["details"] == {
-        "limit": "rate_per_client_per_s", "value": 100, "process_value": 1000,
-    }  # fmt: skip
-    assert session_bench.ask("ping", b"b")["ok"], "another client is not affected"
-    session_bench.now += 0.5
-    assert sum(session_bench.ask("ping")["ok"] for _ in range(60)) == 50
-
-
-def test_the_rate_of_a_process_is_limited_over_all_its_connections() -> None:
-    session_bench = make_bench(rate_per_process_per_s=150, sessions_max=10)
-    assert sum(session_bench.hello(b"%d" % number)["ok"] for number in range(5)) == 5
-    replies = [session_bench.ask("ping", b"%d" % (number % 5)) for number in range(200)]
-    assert sum(reply["ok"] for reply in replies) == 145
-    assert session_bench.hello(b"p", peer=PARENT)["ok"], "another process is not affected"
-
-
-def test_connecting_again_does_not_refill_the_rate_of_a_process() -> None:
-    session_bench = make_bench(rate_per_process_per_s=150)
-    accepted = 0
-    for _ in range(10):
-        accepted += sum(code(session_bench.raw(b"junk")) == "bad_frame" for _ in range(50))
-        session_bench.hang_up()
-    assert accepted == 150
-
-
-def test_a_large_message_is_charged_for_its_size(session_bench: Bench) -> None:
-    """The cost of a message grows with its bytes: 2,000 of 1 MiB a second would take all the time
-    there is."""
-    session_bench.hello()
-    assert code(session_bench.ask("ping", pad="x" * 3000)) == "bad_request"  # 1 + 2
-    assert sum(session_bench.ask("ping")["ok"] for _ in range(150)) == 96
-    session_bench.now += 1
-    assert code(session_bench.raw(Oversize(1 << 30, 4096))) == "message_too_large"
-    session_bench.now += 100
-    assert code(session_bench.ask("ping")) == "limit_exceeded", "a gigabyte is paid for"
-
-
 def test_a_message_that_was_skipped_is_answered(session_bench: Bench) -> None:
     refused = session_bench.raw(Oversize(70_000, 65_536))
     assert code(refused) == "message_too_large"
     assert refused["error"]["details"] == {"size_bytes": 70_000, "limit_bytes": 65_536}
     assert "hello" in refused["error"]["hint"], "a stranger may send less than a client"
-
-
-def test_one_over_the_rate_is_told_so_whatever_it_sent(session_bench: Bench) -> None:
-    """Each is answered to its id, and nothing of it is looked at but that."""
-    session_bench.hello(b"a")
-    connection, received = session_bench.connections[b"a"], session_bench.table.received
-    pings = [received(connection, msgpack.packb({"op": "ping", "id": n})) for n in range(100)]
-    assert pings == [*[True] * 99, False]
-    for payload, request in (
-        (msgpack.packb({"op": "acquire", "id": 7, "spec": 3}), 7),
-        (msgpack.packb({"op": "no such", "id": -1}), None),
-        (msgpack.packb({"id": True}), None),
-        (msgpack.packb([7]), None),
-        (b"\xc1", None),
-        (msgpack.packb({"op": "ping", "id": 8, "pad": "x" * 70_000}), None),
-        (Oversize(1 << 20, 4096), None),
-    ):
-        reply = session_bench.raw(payload)
-        assert (code(reply), reply["re"]) == ("limit_exceeded", request)
-
-
-def test_strangers_do_not_use_up_each_others_rate(session_bench: Bench) -> None:
-    """All connections without a hello shared one budget: one of them kept every other client from
-    its hello."""
-    for _ in range(150):
-        session_bench.raw(b"junk", b"z")
-    assert code(session_bench.raw(b"junk", b"z")) == "limit_exceeded"
-    assert session_bench.hello(b"y", peer=STRANGER)["ok"]
 
 
 def test_one_process_and_one_user_leave_room_for_others() -> None:

@@ -11,7 +11,7 @@ import sys
 import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +19,10 @@ import zmq
 
 from tests.support.waiting import PATIENCE_S
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.ids import ProcessKey
+from vram_arbiter.schemas.runtime import router as router_module
 from vram_arbiter.schemas.runtime.connection import OUT_MESSAGES_MAX, Bounds, Connection
+from vram_arbiter.schemas.runtime.peercred import Peer
 from vram_arbiter.schemas.runtime.router import Router
 from vram_arbiter.schemas.runtime.zmtp import FRAMES_MAX, GREETING, READY, Oversize, encode
 
@@ -31,7 +34,14 @@ GREETING_AND_READY = (
     + (b"\x04)\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER\x08Identity\x00\x00\x00\x00")
 )
 LIMITS = Bounds(
-    message_max_bytes=1 << 20, process_share=1.0, user_share=1.0, handshake_s=30, hello_s=30
+    message_max_bytes=1 << 20,
+    process_share=1.0,
+    user_share=1.0,
+    handshake_s=30,
+    hello_s=30,
+    rate_per_client_per_s=1e6,
+    rate_per_process_per_s=1e6,
+    charge_bytes=1 << 20,
 )
 
 
@@ -40,7 +50,6 @@ class Echo:
     """Admits every connection and sends every payload back."""
 
     admits: bool = True
-    within_rate: bool = True
     open: dict[int, Connection] = field(default_factory=dict)
     ended: list[str] = field(default_factory=list)
     received_from: list[int] = field(default_factory=list)
@@ -51,17 +60,16 @@ class Echo:
         if self.admits:
             connection.admit()
 
-    def received(self, connection: Connection, payload: bytes | bytearray | Oversize) -> bool:
+    def received(self, connection: Connection, payload: bytes | bytearray | Oversize) -> None:
         self.received_from.append(connection.serial)
         if payload == b"fail":
             raise RuntimeError("a defect of the handler")
         if payload == b"close":
             connection.send(b"closing")
             connection.close("as asked")
-            return True
+            return
         answer = b"oversize %d" % payload.size if isinstance(payload, Oversize) else bytes(payload)
         self.dropped += not connection.send(answer)
-        return self.within_rate
 
     def disconnected(self, connection: Connection, reason: str) -> None:
         del self.open[connection.serial]
@@ -328,12 +336,39 @@ async def test_a_flood_of_one_connection_delays_another_by_a_few_messages(path: 
 
 
 async def test_a_connection_over_its_rate_rests_and_loses_nothing(path: Path) -> None:
-    handler = Echo(within_rate=False)
-    async with serving_router(path, handler):
+    """It was answered `limit_exceeded`, and what it had said was lost: a use whose end was refused
+    kept its lease from every eviction."""
+    limits = replace(LIMITS, rate_per_client_per_s=200.0)
+    async with serving_router(path, Echo(), limits):
         raw = await (await Raw.connect(path)).ready()
-        raw.writer.write(encode(b"abc") * 20)
-        assert await raw.reader.readexactly(20 * 5) == encode(b"abc") * 20
+        raw.writer.write(encode(b"abc") * 220)
+        assert await raw.reader.readexactly(220 * 5) == encode(b"abc") * 220
         raw.close()
+
+
+async def test_another_connection_does_not_pay_what_a_process_owes(
+    path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    limits, handler = replace(LIMITS, rate_per_process_per_s=10.0, charge_bytes=1), Echo()
+    async with serving_router(path, handler, limits) as router:
+        first = await (await Raw.connect(path)).ready()
+        assert await first.echo(b"x" * 200) == b"x" * 200  # twenty seconds' worth
+        again = await (await Raw.connect(path)).ready()
+        again.writer.write(encode(b"again"))
+        monkeypatch.setattr(router_module, "identify", lambda _: other)
+        other = Peer(ProcessKey(1, 1), os.getuid(), os.getgid(), -1)
+        stranger = await (await Raw.connect(path)).ready()
+        assert await stranger.echo(b"me?") == b"me?", "another process owes nothing"
+        assert handler.received_from == [1, 3]
+        now, mine = asyncio.get_running_loop().time(), handler.open[1].peer.process
+        router._watch_rates(now)
+        assert f"read more slowly: processes {[mine]}" in caplog.text
+        for raw in (first, again, stranger):
+            raw.close()
+    router._watch_rates(now + 1.0)
+    assert list(router._rates) == [(os.getuid(), mine)], "what is owed is kept"
+    router._watch_rates(now + 100.0)
+    assert not router._rates
 
 
 _ORPHAN = """

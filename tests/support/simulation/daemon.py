@@ -139,8 +139,6 @@ class SimDaemon:
                 operator_reserve=d.OPERATOR_RESERVE,
                 user_share=d.USER_SHARE,
                 process_share=d.PROCESS_SHARE,
-                rate_per_client_per_s=d.RATE_PER_CLIENT_PER_S,
-                rate_per_process_per_s=d.RATE_PER_PROCESS_PER_S,
                 subscribers_max=d.SUBSCRIBERS_MAX,
                 operators_gid=None,
             ),
