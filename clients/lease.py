@@ -145,7 +145,7 @@ class AsyncLease:
         await anyio.lowlevel.checkpoint()  # uses without an `await` must not hide a `revoke`
         try:
             if use._begin_ahead():
-                use._tell()
+                use._tell(begun=True)
             else:
                 await use._begin()
             use_context.enter(use.use_id, use.name)
@@ -363,12 +363,12 @@ class AsyncUse:
             and driver.protocol.holdings.is_certain(lease._record, now)
         )
 
-    def _tell(self) -> int:
-        """Tell the arbiter; return the request. Where it refuses a use that has begun, the lease
-        was revoked in that moment, and leaves after the use."""
+    def _tell(self, *, begun: bool = False) -> int:
+        """Tell the arbiter; return the request. A use that has begun counts there too if the lease
+        was revoked in that moment."""
         lease, driver = self._lease, self._lease._driver
         request = driver.protocol.holdings.use_begin(
-            lease._record, self.use_id, self._label, driver.now()
+            lease._record, self.use_id, self._label, driver.now(), begun=begun
         )
         driver.pump()
         return request

@@ -19,7 +19,7 @@ import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager
-from functools import wraps
+from functools import partial, wraps
 from threading import Thread, current_thread, main_thread
 from types import TracebackType
 from typing import Any, Concatenate, Self
@@ -248,7 +248,7 @@ class Lease(_Blocking[AsyncLease]):
         use = AsyncUse(self._twin, label)
         try:
             if use._begin_ahead():
-                self._portal.soon(use._tell)
+                self._portal.soon(partial(use._tell, begun=True))
             elif wait:
                 self._portal.call(use._begin)
             else:

@@ -92,15 +92,18 @@ class Holdings:
         request = w.Ready(record.lease_id, record.token, measured_bytes)
         return self.ask(record, request, now, on_reply=held)
 
-    def use_begin(self, record: LeaseRecord, use_id: UseId, label: str, now: float) -> int:
-        """The use counts from now on, so that a reattachment on the way names it."""
+    def use_begin(
+        self, record: LeaseRecord, use_id: UseId, label: str, now: float, *, begun: bool = False
+    ) -> int:
+        """The use counts from now on, so that a reattachment on the way names it. `begun`: without
+        waiting for the answer."""
         record.uses.add(use_id)
 
         def refused(error: VramError, _: float) -> None:
             if not isinstance(error, ArbiterUnreachable):  # it may go on until the lease is fenced
                 record.uses.discard(use_id)
 
-        request = w.UseBegin(record.lease_id, record.token, use_id, label)
+        request = w.UseBegin(record.lease_id, record.token, use_id, label, begun)
         return self.ask(record, request, now, on_error=refused)
 
     def use_end(self, record: LeaseRecord, use_id: UseId, now: float) -> int:

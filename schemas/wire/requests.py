@@ -106,10 +106,12 @@ class Ready(OnLease[r.ReadyReply], op="ready"):
 
 class UseBegin(OnLease[r.UsesReply], op="use_begin"):
     """Begin a use. Any client that knows the token may; the use ends with that client's process at
-    the latest."""
+    the latest. `begun`: of the lease's holder, for a use that is in progress since before it heard
+    of a revoke."""
 
     use_id: UseName
     label: Annotated[str, Limits(max_length=d.NAME_MAX_CHARS)] = ""
+    begun: bool = False
 
 
 class UseEnd(OnLease[r.UsesReply], op="use_end"):

@@ -464,9 +464,15 @@ class Consumer:
         return self.ask(w.Ready(lease, self.token(lease), measured_bytes))
 
     def use_begin(
-        self, lease: LeaseId, use: str = "u1", token: Token | None = None, label: str = ""
+        self,
+        lease: LeaseId,
+        use: str = "u1",
+        token: Token | None = None,
+        label: str = "",
+        *,
+        begun: bool = False,
     ) -> list[Effect]:
-        return self.ask(w.UseBegin(lease, token or self.token(lease), UseId(use), label))
+        return self.ask(w.UseBegin(lease, token or self.token(lease), UseId(use), label, begun))
 
     def use_end(self, lease: LeaseId, use: str = "u1", token: Token | None = None) -> list[Effect]:
         return self.ask(w.UseEnd(lease, token or self.token(lease), UseId(use)))

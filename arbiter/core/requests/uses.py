@@ -33,7 +33,7 @@ FROM_JOURNAL: Final = ClientId("")
 
 
 def begin(core: Core, asked: ev.Asked, request: w.UseBegin) -> None:
-    """Mark a use. Refused once the holder is revoked.
+    """Mark a use. Refused once the holder is revoked, unless it had begun the use before it heard.
 
     A repeat, perhaps on a new connection, is answered again: the use ends with that connection.
     """
@@ -49,10 +49,10 @@ def begin(core: Core, asked: ev.Asked, request: w.UseBegin) -> None:
         if known.client != FROM_JOURNAL:
             return
     else:
-        if lease.state in LEAVING:
+        if lease.state in LEAVING and not _was_begun(lease, client, request):
             revoked = None if lease.departure.eviction is None else lease.departure.eviction.why
             raise Refused(no.Revoked(lease.spec.consumer, lease.state, revoked))
-        if lease.state is not LeaseState.HELD:
+        if lease.state not in (LeaseState.HELD, LeaseState.REVOKING):
             raise bad_state(lease, Misfit.NOT_HELD)
         _check_places(core, lease, client)
         core.mark(lease, use)
@@ -63,6 +63,12 @@ def begin(core: Core, asked: ev.Asked, request: w.UseBegin) -> None:
             core.record_lease(lease)  # before the reply: from then on its user counts on it
         core.reply(asked.client, asked.id, UsesReply(len(lease.uses)))
     core.note(UseBeganNote(use.id, use.label, len(lease.uses), known is not None), lease)
+
+
+def _was_begun(lease: Lease, client: Client, request: w.UseBegin) -> bool:
+    """Return whether the holder was in this use before it heard of the revoke."""
+    is_own = client.process == lease.process
+    return request.begun and is_own and lease.state is LeaseState.REVOKING
 
 
 def _check_places(core: Core, lease: Lease, client: Client) -> None:

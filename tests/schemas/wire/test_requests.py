@@ -39,7 +39,10 @@ RECORDED: list[tuple[w.AnyRequest, dict[str, Any]]] = [
         {"op": "acquire", "nonce": "n1", "spec": PLAIN_SPEC, "wait_timeout_s": 4.0},
     ),
     (w.Ready(*ON), {"op": "ready", **REF, "measured_bytes": None}),
-    (w.UseBegin(*ON, UseId("u")), {"op": "use_begin", **REF, "use_id": "u", "label": ""}),
+    (
+        w.UseBegin(*ON, UseId("u")),
+        {"op": "use_begin", **REF, "use_id": "u", "label": "", "begun": False},
+    ),
     (w.UseEnd(*ON, UseId("u")), {"op": "use_end", **REF, "use_id": "u"}),
     (w.Renew((w.LeaseRef(*ON),)), {"op": "renew", "leases": [REF]}),
     (w.RevokeAck(*ON, 1.5), {"op": "revoke_ack", **REF, "safe_point_eta_s": 1.5}),

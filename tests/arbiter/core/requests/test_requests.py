@@ -253,6 +253,23 @@ def test_no_new_use_once_the_holder_was_asked(driver: CoreDriver) -> None:
     assert answer(det.use_begin(lease, "old")) == {"uses": 1}, "a repeat of what runs is fine"
 
 
+def test_a_use_that_began_before_its_holder_heard_of_the_revoke_counts(driver: CoreDriver) -> None:
+    """It was refused, although the holder was in use: an operator saw a holder without uses that
+    did not leave."""
+    det, vlm, runner = (driver.consumer(name) for name in ("det", "vlm", "runner"))
+    lease = det.acquire(5 * GIB)
+    det.load(lease)
+    vlm.acquire(5 * GIB)
+    token = det.token(lease)
+    assert refusal(runner.use_begin(lease, "u", token, begun=True)).code == "lease_revoking"
+    assert answer(det.use_begin(lease, "u", begun=True)) == {"uses": 1}
+    assert (driver.state(lease), driver.notes("use_began")[-1]["uses"]) == ("revoking", 1)
+    det.use_end(lease, "u")
+    assert driver.pushes("revoke")[-1]["uses"] == 0, "it is at its safe point"
+    det.unloading(lease)
+    assert refusal(det.use_begin(lease, "w", begun=True)).code == "lease_revoking"
+
+
 # -- renew
 def test_renewing_keeps_alive_and_never_resurrects(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, ttl_s=10.0, min_residency_s=100.0)
