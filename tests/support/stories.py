@@ -20,12 +20,13 @@ from textwrap import TextWrapper
 from typing import Any
 
 from tests.support import core_driver
-from tests.support.core_driver import START_S, CoreDriver
+from tests.support.core_driver import START_S, Consumer, CoreDriver
 from vram_arbiter.arbiter.core import events
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import Effect, Sample
 from vram_arbiter.schemas import defaults, ids
 from vram_arbiter.schemas.defaults import GIB, MIB
+from vram_arbiter.schemas.ids import LeaseId
 
 KEYS = ("lease_id", "gpu")
 """Fields that name what a view, a record or an explanation is about."""
@@ -55,7 +56,7 @@ class _Story:
         self._quiet_at: list[str] = []
         self._next = ""
         driver = partial(CoreDriver, engine=partial(_ToldArbiter, self))
-        tools = {"CoreDriver": driver, "tell": self.tell}
+        tools = {"CoreDriver": driver, "tell": self.tell, "holder": self.holder}
         self._names = {**vars(defaults), **vars(ids), **vars(events), **vars(core_driver), **tools}
 
     def played(self, command: Example) -> str:
@@ -70,6 +71,20 @@ class _Story:
         """Write down what a question was answered."""
         self._tell_quiet()
         self._line(self._words(value))
+
+    def holder(
+        self, driver: CoreDriver, name: str, *sizes: int, **spec: Any
+    ) -> tuple[Consumer, LeaseId]:
+        """Return a consumer and its lease, which is loaded and was read. How they came there is
+        left out."""
+        before = list(self._lines)
+        consumer = driver.consumer(name)
+        lease = consumer.acquire(*sizes, **spec)
+        consumer.load(lease)
+        driver.advance(0.1)
+        self._tell_quiet()
+        self._lines = before
+        return consumer, lease
 
     def handled(
         self, event: events.Event, now: float, effects: list[Effect], due: float | None
