@@ -72,6 +72,10 @@ class _Story:
         self._tell_quiet()
         self._line(self._words(value))
 
+    def forget(self) -> None:
+        """Show every field again: another engine begins."""
+        self._shown.clear()
+
     def holder(
         self, driver: CoreDriver, name: str, *sizes: int, **spec: Any
     ) -> tuple[Consumer, LeaseId]:
@@ -151,6 +155,7 @@ class _ToldArbiter(Arbiter):
     def __init__(self, story: _Story, *made: Any) -> None:
         super().__init__(*made)
         self._story = story
+        story.forget()
 
     def handle(self, event: events.Event, now: float) -> list[Effect]:
         effects = super().handle(event, now)
