@@ -157,8 +157,6 @@ class Footprints:
                 case [count, loads]:
                     model = self._model(name)
                     model.oom_bytes, model.oom_loads = count, min(loads, OOM_LOADS)
-                case _:
-                    pass
 
     def _model(self, name: str) -> Measured:
         return newest(self._models, name, Measured, MODELS_MAX)

@@ -29,7 +29,7 @@ class Account:
     """One process on one GPU. `GpuLedger` alone writes it, and keeps the sums up to date."""
 
     process: ProcessKey
-    changed_at: float
+    changed_at: float = 0.0
     charges: dict[LeaseId, "Charge"] = field(default_factory=dict)
     retained_bytes: int = 0  # outside its leases
     retained_floor_bytes: int = 0  # declared; more was measured and may shrink down to this
@@ -112,9 +112,8 @@ class GpuLedger:
         if not 0 <= used <= total + self.tolerance_bytes:
             return f"impossible reading: {used} of {total} bytes are used"
         for use in reading.processes or ():
-            held_bytes = use.used_bytes or 0
-            if not 0 <= held_bytes <= total + self.tolerance_bytes:
-                told = f"process {use.process.pid} holds {held_bytes} of {total} bytes"
+            if not 0 <= use.held_bytes <= total + self.tolerance_bytes:
+                told = f"process {use.process.pid} holds {use.held_bytes} of {total} bytes"
                 return f"impossible reading: {told}"
         return ""
 
@@ -149,8 +148,6 @@ class GpuLedger:
         """Return the total if some leases left (each retaining the bytes given) and processes got
         so many more, beside stowaways or without."""
         total = self._held_bytes + (self.stowaway_bytes if stowaways else 0)
-        if not leaving and not joining:
-            return total
         more: dict[Account, int] = {}  # what joins, less the charges that leave
         kept: dict[Account, int] = {}  # where leases leave: the least that their process retains
         for process, count in joining:
@@ -158,8 +155,8 @@ class GpuLedger:
             if account is not None:
                 more[account] = count
             else:
-                known = stowaways and self.stowaways
-                total += max(0, count - (self._stowaway_bytes(process) if known else 0))
+                held_bytes = self._stowaway_bytes(process) if stowaways else 0
+                total += max(0, count - held_bytes)
         for lease, retained_bytes in leaving.items():
             charge = self.charges.get(lease)
             if charge is not None:
@@ -218,7 +215,7 @@ class GpuLedger:
         now: float,
     ) -> None:
         """Charge a grant, or after a restart what a holder reports."""
-        account = self.accounts.get(process) or self._open(process, now)
+        account = self.accounts.get(process) or self._open(process)
         self._change(lease, Charge(account, charged_bytes, approved_bytes), now)
 
     def recharge(self, lease: LeaseId, charged_bytes: int, now: float) -> None:
@@ -250,7 +247,7 @@ class GpuLedger:
     ) -> None:
         """Charge (or, with 0, forget) what a process retains outside its leases; `floor_bytes` of
         it were declared."""
-        account = self.accounts.get(process) or self._open(process, now)
+        account = self.accounts.get(process) or self._open(process)
         account.retained_bytes = retained_bytes
         floor_bytes = max(account.retained_floor_bytes, floor_bytes)
         account.retained_floor_bytes = min(floor_bytes, retained_bytes)
@@ -318,12 +315,12 @@ class GpuLedger:
         named = (one for process, one in self.accounts.items() if process.pid == listed.pid)
         return next(named, None)
 
-    def _open(self, process: ProcessKey, now: float) -> Account:
+    def _open(self, process: ProcessKey) -> Account:
         """Return the new account of a process, which is no stowaway from now on."""
         for listed in (process, ProcessKey(process.pid, 0)):
             if listed in self.stowaways:
                 self.stowaway_bytes -= self.stowaways.pop(listed).held_bytes
-        account = self.accounts[process] = Account(process, now)
+        account = self.accounts[process] = Account(process)
         return account
 
     def _stowaway_bytes(self, process: ProcessKey) -> int:
@@ -411,7 +408,7 @@ class HostRam:
 # -- what a reading tells
 def bytes_by_process(reading: MemorySampled) -> dict[ProcessKey, int]:
     """Return the bytes of the listed processes; 0 where the driver does not say."""
-    return {use.process: use.used_bytes or 0 for use in reading.processes or ()}
+    return {use.process: use.held_bytes for use in reading.processes or ()}
 
 
 def bytes_of(reading: MemorySampled, process: ProcessKey, *, omitted: int | None = 0) -> int | None:

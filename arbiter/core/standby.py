@@ -83,20 +83,20 @@ def give_up(core: Core, lease: Lease, to: LeaseState, refusal: End) -> bool:
     if lease.state in AWAY:
         core.end_away(lease, to, refusal)
         return True
-    if lease.state is not LeaseState.VERIFYING:
+    if lease.state is not LeaseState.VERIFYING or lease.next_state is None:
         return False
     standby = lease.standby
-    leaves = standby.comes_back or standby.parks
     standby.comes_back = standby.parks = False
     standby.recalled_at = None
     core.host_ram.free(lease.id)
-    return leaves
+    core.record_lease(lease)
+    return True
 
 
 def on_away_due(core: Core, lease_id: str) -> None:
     """A holder did not reattach after a restart."""
     lease = core.leases[LeaseId(lease_id)]
-    core.end_away(lease, LeaseState.CANCELLED, no.Lost(lease.id, Why.NOT_BACK))
+    give_up(core, lease, LeaseState.CANCELLED, no.Lost(lease.id, Why.NOT_BACK))
 
 
 # -- wanted by the holder --------------------------------------------------------------------------
@@ -143,20 +143,16 @@ def first_to_return(away: Mapping[LeaseId, Lease], gpu: Gpu) -> Lease | None:
     By priority, then in the order of their leaving. One that does not fit yet keeps its turn:
     others pass it only where it would still fit beside them.
     """
-    ahead: Lease | None = None
-    spare_bytes = 0
-    for lease in _by_turn(away, gpu):
-        if ahead is not None and (
-            ahead.spec.exclusive or admission.added_bytes(gpu, lease) > spare_bytes
-        ):
-            continue
-        if admission.fits(gpu, lease):
-            return lease
-        if ahead is None:
-            ahead = lease
-            passed = partial(_returned_since, lease.standby.since)
-            spare_bytes, _ = admission.spare_unplanned_bytes(gpu, lease, {}, passed)
-    return None
+    in_turn = _by_turn(away, gpu)
+    if not in_turn or admission.fits(gpu, in_turn[0]):
+        return next(iter(in_turn), None)
+    ahead, *others = in_turn
+    if ahead.spec.exclusive:
+        return None
+    passed = partial(_returned_since, ahead.standby.since)
+    spare_bytes, _ = admission.spare_unplanned_bytes(gpu, ahead, {}, passed)
+    beside = (one for one in others if admission.added_bytes(gpu, one) <= spare_bytes)
+    return next((one for one in beside if admission.fits(gpu, one)), None)
 
 
 def quiet_at(gpu: Gpu, lease: Lease) -> float:

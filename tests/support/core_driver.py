@@ -259,13 +259,15 @@ class CoreDriver:
         self.settings = replace(self.settings, gpus=gpus)
         self.devices[gpu].total_bytes = capacity_bytes
 
-    def restart(self, *, epoch: int = 2, keep_journal: bool = True) -> None:
-        """kill -9 of the daemon: a new core, the journal's records, no memory of anything else."""
+    def restart(self, *, epoch: int = 2, keep_journal: bool = True, start: bool = True) -> None:
+        """kill -9 of the daemon: a new core, the journal's records, no memory of anything else.
+        `start`: until the first reading."""
         self.settings = replace(self.settings, epoch=epoch)
         self.arbiter = self._engine(self.settings, self.now)
         self._readings.clear()
         self.post(Recovered(records_of(self.journal) if keep_journal else {}))
-        self.advance(0.01)
+        if start:
+            self.advance(0.01)
 
     # -- people
     def consumer(

@@ -344,6 +344,9 @@ class Core:
         _take_out(self.of_client, lease.client, lease.id)
         lease.client = client
         self.of_client.setdefault(client, {})[lease.id] = lease
+        if ("away", lease.id) in self.timers:  # after a restart: its holder is back
+            self.timers.cancel(("away", lease.id))
+            lease.attached = True
 
     def leases_of(self, process: ProcessKey) -> list[Lease]:
         """Live leases of a process, oldest first."""
@@ -403,8 +406,6 @@ class Core:
         """Queue a lease that is away. Without a request (`asked`) its grant is pushed."""
         request = lease.request
         self.move(lease, LeaseState.QUEUED, Why.WANTED)
-        self.timers.cancel(("away", lease.id))  # after a restart: its holder reattached
-        lease.attached = True
         self.hand_to(lease, client)
         request.id, request.answered = asked, asked is None
         request.arrived_at, request.arrival = asked_at, self.next_arrival()

@@ -88,8 +88,8 @@ def _restore(core: Core, record: LeaseRecord, why: Why) -> Lease:
 
     1. What it holds on a GPU is charged.
     2. A debt has no holder to wait for: its bytes are measured away.
-    3. A lease that is away does not keep others waiting, nor comes back before its holder.
-    4. The bytes of a lease that is verified are measured away.
+    3. The bytes of a lease that is verified are measured away.
+    4. A lease that is away, or will be, keeps no others waiting, nor comes back before its holder.
     5. Every other holder has its time to reattach. What others use stays in use.
     """
     grace_s = core.settings.fence_grace_s
@@ -109,13 +109,14 @@ def _restore(core: Core, record: LeaseRecord, why: Why) -> Lease:
     core.add(lease)
     if record.parked_bytes:
         core.host_ram.find(lease.id, record.parked_bytes)
-    if gpu is None:  # 3
+    if gpu is None:
         core.away[lease.id] = lease
-        core.timers.set(("away", lease.id), core.now + lease.spec.ttl_s + grace_s)
-        return lease
-    gpu.residents.add(lease)
-    if lease.state is LeaseState.VERIFYING:  # 4
+    else:
+        gpu.residents.add(lease)
+    if gpu is not None and lease.state is LeaseState.VERIFYING:  # 3
         begin_for_lease(core, gpu, lease, alive=True)
+    if lease.state not in EXPIRING:  # 4
+        core.timers.set(("away", lease.id), core.now + lease.spec.ttl_s + grace_s)
         return lease
     core.keep(lease, grace_s)  # 5
     if lease.state is LeaseState.HELD:
@@ -135,7 +136,7 @@ def _found(
         arrival=arrival,
         load_peak_bytes=record.load_peak_bytes,
         steady_bytes=max(sizes.steady_bytes, sizes.residue_bytes),
-        gpus=named if record.gpu is None else (GpuId(record.gpu),),
+        gpus=named,
     )
     return Lease.recovered(record, request, now, why)
 
@@ -145,9 +146,7 @@ def _charge(gpu: Gpu, lease: Lease, charge_bytes: int, now: float) -> None:
     pressure."""
     approved_bytes = min(charge_bytes, _room_bytes(gpu))
     gpu.ledger.charge(lease.id, lease.process, charge_bytes, approved_bytes, now)
-    gpu.pending_free.give_up(
-        lease.process, max(0, lease.request.load_peak_bytes - charge_bytes), now
-    )
+    gpu.pending_free.give_up(lease.process, lease.request.load_peak_bytes - charge_bytes, now)
     gpu.changed_at = now
 
 
@@ -231,7 +230,6 @@ def _reattach(core: Core, client: Client, item: ReattachLease) -> Lease:
 def _reattach_away(core: Core, lease: Lease, item: ReattachLease) -> None:
     """Believe a holder whose lease, it says, is away; its release, or the grant, was lost."""
     if lease.state in AWAY:
-        core.timers.cancel(("away", lease.id))
         core.wake_candidates(lease)
     elif lease.token != item.token:
         core.push(lease, GrantedPush(status.view(core, lease)))

@@ -241,12 +241,9 @@ def cancel(core: Core, asked: ev.Asked, request: w.Cancel) -> None:
     if lease.process != core.clients[asked.client].process:
         raise Refused(no.NotHolder(lease.id, lease.process.pid))
     refusal = no.CancelledRequest(lease.id, Why.HOLDER_GAVE_UP)
-    if standby.give_up(core, lease, LeaseState.CANCELLED, refusal):
-        if lease.state is LeaseState.VERIFYING:  # over with its verdict
-            core.record_lease(lease)
-    elif lease.state is LeaseState.QUEUED:
+    if lease.state is LeaseState.QUEUED:
         cancel_waiter(core, lease, Why.HOLDER_GAVE_UP)
-    else:
+    elif not standby.give_up(core, lease, LeaseState.CANCELLED, refusal):
         raise bad_state(lease, Misfit.GRANTED)
     core.reply(asked.client, asked.id, StateReply(lease.state))
 
@@ -331,7 +328,7 @@ def become_held(core: Core, lease: Lease, measured_bytes: int | None) -> None:
     if measured_bytes is not None:
         steady = max(measured_bytes, lease.spec.footprint.residue_bytes)
     peak = max(request.load_peak_bytes, lease.observed.peak_bytes)
-    gpu.pending_free.give_up(lease.process, max(0, peak - steady), core.now)
+    gpu.pending_free.give_up(lease.process, peak - steady, core.now)
     gpu.ledger.recharge(lease.id, steady, core.now)
     gpu.changed_at = core.now
     gpu.want_sample(core.now, core.now)  # what it holds now is what has to come back one day

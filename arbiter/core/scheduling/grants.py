@@ -114,7 +114,7 @@ def _make_room(core: Core, gpu: Gpu, head: Lease) -> bool:
     if leaving and admission.fits(gpu, head, leaving):
         request.reason = Wait.MAKING_ROOM
         return True
-    if gpu.verifications and admission.residue_under_measurement(gpu):
+    if admission.residue_under_measurement(gpu):
         request.reason = Wait.RESIDUE
         return False
     choice = Choice.of(core)
@@ -189,7 +189,7 @@ def _is_best_place(
 
 
 def _place_cost(gpu: Gpu, plan: Sequence[Lease]) -> tuple[int, ...]:
-    highest = max([one.spec.priority for one in plan], default=0)
+    highest = max(one.spec.priority for one in plan)
     steady_bytes = sum(one.request.steady_bytes for one in plan)
     return (in_use(plan), highest, len(plan), steady_bytes, gpu.info.index)
 

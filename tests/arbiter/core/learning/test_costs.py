@@ -2,7 +2,7 @@
 
 import pytest
 
-from vram_arbiter.arbiter.core.learning import Costs, Reuse
+from vram_arbiter.arbiter.core.learning import Costs, Failures, Reuse
 
 LEARNT = {
     "a": {"load_s": 6.0, "unload_s": 1.0, "verify_s": 2.0},
@@ -38,16 +38,17 @@ def test_only_two_that_switched_both_ways_within_the_window_cost_a_switch() -> N
     assert costs.switch_s("a", "b", 129.9) == 1.0 + 2.0 + 10.0, "unload, verify, the other's load"
     assert costs.switch_s("b", "a", 129.9) == 3.0 + 4.0 + 6.0
     assert costs.switch_s("a", "b", 130.0) == 0.0, "one way is older than the window"
-    costs.switched("c", "d", 130.0)
-    assert costs.switches == {("b", "a"): 110.0, ("c", "d"): 130.0}
+    costs.switched("a", "d", 130.0)
+    assert costs.switches == {("b", "a"): 110.0, ("a", "d"): 130.0}
+    costs.switched("d", "a", 130.0)
+    assert (costs.switch_s("a", "d", 130.0), costs.switch_s("d", "a", 130.0)) == (3.0, 6.0)
 
 
 def test_durations_are_medians_and_none_where_a_phase_was_never_seen() -> None:
     costs = Costs({"a": {"drain_s": 2.0}}, 30.0)
-    costs.learn("a", "drain_s", -1.0)
-    costs.learn("a", "drain_s", 9.0)
-    costs.learn("a", "load_s", 4.0)
-    assert costs.medians() == {"a": {"drain_s": 2.0, "load_s": 4.0}}
+    for phase, seconds in (("drain_s", 1.0), ("drain_s", 9.0), ("load_s", 4.0), ("verify_s", -1.0)):
+        costs.learn("a", phase, seconds)
+    assert costs.medians() == {"a": {"drain_s": 2.0, "load_s": 4.0, "verify_s": 0.0}}
     assert costs.usual_s("a", ("drain_s", "load_s")) == 6.0
     assert costs.usual_s("a", ("drain_s", "unload_s")) is None
 
@@ -63,4 +64,4 @@ def test_a_load_that_keeps_failing_is_paused_for_longer_each_time_up_to_a_minute
     costs.load_failed("m", "died", 700.0)
     assert costs.failures["m"].count == 10, "ten minutes later they still are in a row"
     costs.load_failed("m", "died", 1300.1)
-    assert (costs.failures["m"].count, costs.failures["m"].last_at) == (1, 1300.1)
+    assert costs.failures == {"m": Failures(1, 1300.1, "died")}

@@ -1,6 +1,30 @@
 """What was measured of a model, and what of it counts for the next request."""
 
+import pytest
+
 from vram_arbiter.arbiter.core.learning import HISTORY_MAX, MODELS_MAX, OOM_LOADS, Footprints
+from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
+
+
+@pytest.mark.parametrize(
+    ("declared", "learned", "expected"),
+    [
+        (Footprint(5, 4, 1), {}, (5, 4)),
+        (Footprint(5, 4, 6), {}, (6, 6)),
+        (Footprint(5, 4, 1), {"load_peak": [3], "steady": [2], "residue": [7]}, (5, 4)),
+        (Footprint(5, 4, 1), {"load_peak": [7]}, (7, 4)),
+        (Footprint(5, 4, 1), {"steady": [7]}, (7, 7)),
+        (Footprint(5, 4, 1), {"load_peak": [9], "steady": [9]}, (8, 8)),
+        (Footprint(9, 9, 9), {"load_peak": [10], "steady": [10]}, (9, 9)),
+    ],
+)
+def test_a_request_is_charged_the_larger_of_what_is_declared_and_what_was_learned(
+    declared: Footprint, learned: dict[str, list[int]], expected: tuple[int, int]
+) -> None:
+    """What was learned never asks for more than the largest GPU has."""
+    prints = Footprints(8)
+    prints.restore({"det m": learned, "det other": {"load_peak": [8], "steady": [8]}})
+    assert prints.expected_bytes(LeaseSpec("det", "m", declared)) == expected
 
 
 def test_few_measurements_count_by_their_maximum_and_many_by_their_95th_percentile() -> None:
@@ -59,7 +83,7 @@ def test_what_is_not_understood_is_left_out() -> None:
     prints = Footprints(1 << 60)
     prints.restore(
         {
-            "a": {"load_peak": 5, "steady": ["x", -1, 3], "oom": [1], "more": [1]},
+            "a": {"load_peak": 5, "steady": ["x", -1, 0, 3], "oom": [1], "more": [1]},
             "b": {"oom": [5, 999]},
         }
     )

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.scenes import give_back, why
+from tests.support.scenes import give_back
 from vram_arbiter.arbiter.core.effects import Note, Push
 from vram_arbiter.arbiter.core.events import (
     Asked,
@@ -15,6 +15,7 @@ from vram_arbiter.arbiter.core.events import (
     MemorySampled,
     Recovered,
 )
+from vram_arbiter.arbiter.core.model.lease import Use
 from vram_arbiter.arbiter.core.model.records import ResidueRecord
 from vram_arbiter.arbiter.host.records import records_of
 from vram_arbiter.schemas.defaults import GIB, MIB
@@ -177,7 +178,7 @@ def test_a_holder_that_never_comes_back_expires_and_is_measured_away(driver: Cor
     driver.device.held.clear()
     driver.device.set(driver.consumer("x").process, 1 * GIB, driver.now)
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=12.0)
-    assert driver.notes("serving")
+    assert [note["seconds"] for note in driver.notes("serving")] == [pytest.approx(15.0)]
     assert driver.journal.keys() == {f"lease:{waiter}"}
 
 
@@ -278,12 +279,16 @@ def test_a_use_keeps_its_label_when_its_holder_comes_back(driver: CoreDriver) ->
     """By another connection of the same instance: nobody said that the one before is gone."""
     det, lease, token = held_with_token(driver, "det", 5)
     det.use_begin(lease, label="grab")
+    began_at = driver.now
+    driver.advance(1.0)
     before, det.client = det.client, ClientId("back")
     instance = f"det-{before}"
     driver.post(ClientConnected(det.client, det.process, det.uid, "det", instance))
-    det.reattach(lease, token, uses=("u1",))
-    driver.consumer("vlm").acquire(5 * GIB)
-    assert 'finish 1 use "grab"' in why(driver, "vlm")["next"]
+    det.reattach(lease, token, uses=("u1", "u2"))
+    assert list(driver.arbiter.inspect().leases[lease].uses.values()) == [
+        Use(UseId("u1"), det.client, det.process, "grab", began_at),
+        Use(UseId("u2"), det.client, det.process, "", driver.now),
+    ]
 
 
 def test_what_a_process_keeps_beyond_its_context_comes_back_after_a_restart_too() -> None:

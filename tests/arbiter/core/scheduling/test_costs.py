@@ -38,14 +38,6 @@ def test_who_can_park_goes_before_who_cannot() -> None:
     assert asked(driver, {"stuck": stuck, "parks": parks}) == ["parks"]
 
 
-def test_who_could_park_but_finds_no_room_is_like_the_others() -> None:
-    driver = CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": 1 * GIB})
-    _, stuck = held(driver, "stuck", 3)
-    _, parks = held(driver, "parks", 3, park_bytes=3 * GIB)
-    driver.consumer("w").acquire(4 * GIB)
-    assert asked(driver, {"stuck": stuck, "parks": parks}) == ["stuck"], "least recently used"
-
-
 def test_a_lower_priority_goes_whatever_it_costs() -> None:
     driver = CoreDriver(
         8 * GIB, settings={"learnt": {"cheap": {"load_s": 0.1}, "dear": {"load_s": 99.0}}}
@@ -86,15 +78,6 @@ def test_who_never_comes_back_is_cheaper_to_send_away(driver: CoreDriver) -> Non
     assert core.costs.reuse["regular"].chance() > 0.5 > core.costs.reuse["rare"].chance()
     driver.consumer("w").acquire(4 * GIB)
     assert asked(driver, leases) == ["rare"], "though it was used last"
-
-
-def test_many_candidates_are_searched_with_parking_in_mind_too() -> None:
-    driver = CoreDriver(17 * GIB, settings={"host_ram_budget_bytes": 64 * GIB})
-    leases = {
-        f"n{n}": held(driver, f"n{n}", 1, park_bytes=GIB if n == 9 else 0)[1] for n in range(16)
-    }
-    driver.consumer("w").acquire(int(1.2 * GIB))
-    assert asked(driver, leases) == ["n9"]
 
 
 # -- thrash

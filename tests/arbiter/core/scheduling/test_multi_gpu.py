@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
-from tests.support.scenes import give_back, held, in_use, place
+from tests.support.scenes import give_back, held, in_use, place, verdicts
 from vram_arbiter.arbiter.core.events import ProcessDied
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import GpuId, LeaseId
@@ -195,15 +195,15 @@ def test_a_holder_that_outstays_on_one_gpu_frees_its_waiter_for_another(driver: 
 
 def test_a_leave_that_was_not_enough_frees_its_waiter_for_another_gpu(driver: CoreDriver) -> None:
     """The bytes of the victim stay on GPU 0 as a residue that nobody expected: GPU 1 is emptied
-    then."""
+    at once."""
     leaky, a = held(driver, "leaky", 6, gpu="0", priority=10)
     _, b = held(driver, "b", 6, gpu="1", priority=20)
     waiter = driver.consumer("w").acquire(6 * GIB)
     assert (driver.state(a), driver.state(b)) == ("revoking", "held")
     leaky.unloading(a)
     leaky.release(a)
-    driver.until(lambda: driver.state(b) == "revoking", limit_s=15.0)
-    assert driver.state(waiter) == "queued"
+    driver.until(lambda: verdicts(driver) == [("residue", True)], limit_s=15.0)
+    assert (driver.state(b), driver.state(waiter)) == ("revoking", "queued")
 
 
 # -- at once, and without asking

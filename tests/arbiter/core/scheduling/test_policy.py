@@ -18,8 +18,8 @@ from vram_arbiter.schemas.wire.codes import Block
 class Scene:
     """A GPU with holders; `want` says who is asked when somebody wants room."""
 
-    def __init__(self, capacity_bytes: int = 8 * GIB + d.RESERVE_BYTES) -> None:
-        self.driver = CoreDriver(capacity_bytes)
+    def __init__(self, capacity_bytes: int = 8 * GIB + d.RESERVE_BYTES, **settings: Any) -> None:
+        self.driver = CoreDriver(capacity_bytes, settings=settings)
         self.names: dict[LeaseId, str] = {}
         self.people: dict[str, Consumer] = {}
         self.held: dict[str, LeaseId] = {}
@@ -104,13 +104,34 @@ def test_who_is_asked(case: str) -> None:
         assert scene.asked() == set()
 
 
-def test_of_the_same_size_the_least_recently_used_goes() -> None:
-    scene = Scene()
-    scene.hold("old", 3)
-    scene.hold("new", 3)
-    scene.people["old"].use_begin(scene.held["old"])
-    scene.people["old"].use_end(scene.held["old"])
-    assert scene.want(4) == {"new"}
+PARKS = {"park_bytes": 3 * GIB}
+ORDER: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "idle before in use": ({"used": True, "priority": 10}, {"priority": 20}),
+    "lower priority before parking": ({"priority": 20, **PARKS}, {"priority": 10}),
+    "parking before the last use": ({"last_at": 5.0}, {"last_at": 6.0, **PARKS}),
+    "without host RAM for it": ({"last_at": 6.0, "park_bytes": 9 * GIB}, {"last_at": 5.0}),
+    "the least recent use": ({"last_at": 6.0}, {"last_at": 5.0}),
+}
+
+
+@pytest.mark.parametrize("others", [0, 12])
+@pytest.mark.parametrize("case", [*ORDER, "the oldest request"])
+def test_which_of_two_alike_goes(case: str, others: int) -> None:
+    """Beside a dozen others, which cost more, the search is greedy."""
+    scene = Scene((6 + others) * GIB + d.RESERVE_BYTES, host_ram_budget_bytes=8 * GIB)
+    holders: dict[str, dict[str, Any]] = {"goes": {"last_at": 5.0}, "stays": {"last_at": 5.0}}
+    if case in ORDER:
+        holders = dict(zip(("stays", "goes"), ORDER[case], strict=True))
+    for name, traits in holders.items():
+        spec = {key: value for key, value in traits.items() if key not in ("used", "last_at")}
+        scene.hold(name, 3, **spec)
+        lease = state_of(scene.driver.arbiter).leases[scene.held[name]]
+        lease.uses.last_at = traits.get("last_at", lease.uses.last_at)
+        if "used" in traits:
+            scene.use(name)
+    for number in range(others):
+        scene.hold(f"other{number}", 1, priority=90)
+    assert scene.want(2) == {"goes"}
 
 
 def test_in_use_is_asked_when_nothing_else_helps_and_only_as_few_as_needed() -> None:

@@ -46,9 +46,11 @@ def test_it_ends_with_its_connection(driver: CoreDriver, reason: str) -> None:
 def test_who_ends_during_the_measurement_does_not_want_it_back(
     driver: CoreDriver, end: Callable[[Consumer], object]
 ) -> None:
+    """The journal has it too: a restart brought back what its holder had given up."""
     det, lease, _, wanted = revoked(driver)
     det.unload(lease)
     end(det)
+    assert "comes_back" not in driver.journal[f"lease:{lease}"]
     driver.until(lambda: driver.state(wanted) == "loading")
     assert driver.state(lease) == "over"
 

@@ -1,5 +1,7 @@
 """A restart of the daemon loses no lease on standby, at whichever step of its way it comes."""
 
+import pytest
+
 from tests.support.core_driver import CoreDriver, answer, refusal
 from tests.support.scenes import held, revoked, sent_away, shown
 from vram_arbiter.arbiter.core.effects import Push
@@ -39,6 +41,23 @@ def test_a_holder_that_does_not_come_back_loses_it(driver: CoreDriver) -> None:
     assert driver.state(lease) == "standby"
     driver.advance(0.2)
     assert driver.state(lease) == "over"
+    assert f"lease:{lease}" not in driver.journal
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_holder_that_does_not_come_back_to_its_verdict_loses_it(
+    driver: CoreDriver, measured: bool
+) -> None:
+    """Only a lease that was away at the restart had a time: this one kept its host RAM for ever."""
+    det, lease, _, _ = revoked(driver, ttl_s=10.0)
+    det.unload(lease)
+    driver.device.silent = not measured
+    driver.restart()
+    driver.advance(14.9)
+    assert driver.state(lease) == ("standby" if measured else "verifying")
+    driver.advance(0.2)
+    driver.device.silent = False
+    driver.until(lambda: driver.state(lease) == "over")
     assert f"lease:{lease}" not in driver.journal
 
 

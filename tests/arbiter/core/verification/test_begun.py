@@ -1,7 +1,6 @@
-"""How a verification begins: what may stay, and which reading it is compared with."""
+"""How a verification begins: what may stay, which reading it is compared with, and its clock."""
 
 from collections.abc import Callable
-from dataclasses import fields
 from typing import Any
 
 import pytest
@@ -9,19 +8,32 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.engine_state import state_of
 from tests.support.scenes import give_back, held
-from vram_arbiter.schemas.defaults import MIB
+from vram_arbiter.arbiter.core.model.lease import Verification
+from vram_arbiter.schemas import defaults as d
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import LeaseId
 
 RESIDUE_BYTES = 450 * MIB
+TTL_S = 20.0
+GRACE_S = d.FENCE_GRACE_S
 
 
-def under_way(driver: CoreDriver) -> dict[str, Any]:
-    """The only verification that is under way, but for its clock."""
+def under_way(driver: CoreDriver) -> Verification:
+    """The only verification that is under way."""
     (one,) = state_of(driver.arbiter).gpus[driver.device.gpu].verifications.values()
-    clock = ("paced_from", "deadline_at", "next_poll_at", "last_used_bytes")
-    return {
-        field.name: getattr(one, field.name) for field in fields(one) if field.name not in clock
+    return one
+
+
+def begun(at: float, grace_s: float = 0.0, **fields: Any) -> Verification:
+    """A verification that begins at this moment, without a verdict for `grace_s`."""
+    clock = {
+        "confirmed_at": at,
+        "not_before": at + grace_s,
+        "paced_from": at + grace_s,
+        "deadline_at": at + grace_s + d.VERIFY_TIMEOUT_S,
+        "next_poll_at": at + max(grace_s, d.VERIFY_CONFIRM_S),
     }
+    return Verification(**{**clock, **fields})
 
 
 def leaves(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
@@ -38,41 +50,80 @@ def dies(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
     det.die()
 
 
+def expires(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
+    view = driver.view(lease)
+    assert view is not None
+    driver.advance(view["ttl_left_s"])
+
+
+def restarts(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
+    driver.restart(start=False)
+
+
+def leaves_and_restarts(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
+    leaves(driver, det, lease)
+    restarts(driver, det, lease)
+
+
+def expires_and_restarts(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
+    expires(driver, det, lease)
+    restarts(driver, det, lease)
+
+
+def restarts_and_expires(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
+    driver.restart()
+    expires(driver, det, lease)
+
+
+LIVES = {"alive": True, "vanishes": False, "retained_bytes": RESIDUE_BYTES}
+DEAD = {"alive": False, "vanishes": True, "retained_bytes": 0}
+FENCED = {"fenced_at": GRACE_S}
+UNSEEN = {"baseline": None, "baseline_comparable": False}
+
+
 @pytest.mark.parametrize(
-    ("how", "alive", "vanishes", "stays_bytes"),
-    [(leaves, True, False, RESIDUE_BYTES), (exits, True, True, 0), (dies, False, True, 0)],
+    ("how", "grace_s", "expected"),
+    [
+        (leaves, 0.0, LIVES),
+        (exits, 0.0, {**DEAD, "alive": True}),
+        (dies, 0.0, DEAD),
+        (expires, GRACE_S, LIVES | FENCED),
+        (leaves_and_restarts, 0.0, LIVES | UNSEEN),
+        (expires_and_restarts, GRACE_S, LIVES | UNSEEN | {"fenced_at": TTL_S + GRACE_S}),
+        (restarts_and_expires, 0.0, LIVES | {"fenced_at": 0.0}),
+    ],
 )
 def test_what_a_holder_declared_may_stay_only_while_it_lives(
     driver: CoreDriver,
     how: Callable[[CoreDriver, Consumer, LeaseId], None],
-    alive: bool,
-    vanishes: bool,
-    stays_bytes: int,
+    grace_s: float,
+    expected: dict[str, Any],
 ) -> None:
-    det, lease = held(driver, "det", 5, residue_bytes=RESIDUE_BYTES)
+    """`expected`: `fenced_at` is in seconds from now; otherwise there is none."""
+    det, lease = held(driver, "det", 5, residue_bytes=RESIDUE_BYTES, exclusive=True, ttl_s=TTL_S)
     driver.advance(1.0)
     driver.device.lag_s = 1.0
-    baseline = state_of(driver.arbiter).gpus[driver.device.gpu].sample
-    assert baseline is not None
     how(driver, det, lease)
-    assert under_way(driver) == {
-        "key": lease,
-        "process": det.process,
-        "lease": lease,
-        "consumer": "det",
-        "model": "det det-model",
-        "retained_bytes": stays_bytes,
-        "baseline": baseline,
-        "baseline_comparable": True,
-        "confirmed_at": driver.now,
-        "not_before": driver.now,
-        "alive": alive,
-        "vanishes": vanishes,
-        "exclusive": False,
-        "fenced_at": 0.0,
-        "verdict": None,
-        "overdue": False,
-    }
+    at = driver.now
+    found = under_way(driver)
+    fenced = {"fenced_at": at + expected["fenced_at"]} if "fenced_at" in expected else {}
+    assert found == begun(
+        **{
+            "at": at,
+            "grace_s": grace_s,
+            "key": lease,
+            "process": det.process,
+            "lease": lease,
+            "consumer": "det",
+            "model": "det det-model",
+            "baseline": found.baseline,
+            "baseline_comparable": True,
+            "exclusive": True,
+            **expected,
+            **fenced,
+        }
+    )
+    assert found.baseline is None or found.baseline.used_bytes == 5 * GIB
 
 
 @pytest.mark.parametrize("seen", [True, False], ids=["seen", "not seen yet"])
@@ -87,21 +138,14 @@ def test_what_a_dead_process_kept_is_compared_with_the_newest_reading(
     baseline = state_of(driver.arbiter).gpus[driver.device.gpu].sample
     assert baseline is not None
     det.die()
-    assert under_way(driver) == {
-        "key": f"residue:{det.process}",
-        "process": det.process,
-        "lease": None,
-        "consumer": str(det.process),
-        "model": "",
-        "retained_bytes": 0,
-        "baseline": baseline,
-        "baseline_comparable": seen,
-        "confirmed_at": driver.now,
-        "not_before": driver.now,
-        "alive": False,
-        "vanishes": True,
-        "exclusive": False,
-        "fenced_at": 0.0,
-        "verdict": None,
-        "overdue": False,
-    }
+    assert under_way(driver) == begun(
+        driver.now,
+        key=f"residue:{det.process}",
+        process=det.process,
+        lease=None,
+        consumer=str(det.process),
+        model="",
+        baseline=baseline,
+        baseline_comparable=seen,
+        **DEAD,
+    )

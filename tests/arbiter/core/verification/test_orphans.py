@@ -11,8 +11,12 @@ from vram_arbiter.schemas.ids import ProcessKey
 CHILD = ProcessKey(4000, 1)
 
 
-@pytest.mark.parametrize("read_first", [False, True], ids=["death, reading", "reading, death"])
-def test_the_verdict_does_not_depend_on_what_is_seen_first(read_first: bool) -> None:
+@pytest.mark.parametrize(
+    ("read_first", "listed"),
+    [(False, False), (True, False), (True, True)],
+    ids=["death, reading", "reading, death", "reading without bytes of it, death"],
+)
+def test_the_verdict_does_not_depend_on_what_is_seen_first(read_first: bool, listed: bool) -> None:
     """Under load a reading that shows the orphan came before the death of its parent, and the
     verdict said `verified` with the 4 GiB still there. They were the orphan's on the ledger, so
     nothing was granted on them; only the note was wrong."""
@@ -22,6 +26,8 @@ def test_the_verdict_does_not_depend_on_what_is_seen_first(read_first: bool) -> 
     driver.advance(2.0)
     driver.device.set(parent.process, 0, driver.now)
     driver.device.set(CHILD, 4 * GIB, driver.now)
+    if listed:
+        driver.device.held[parent.process] = 0
     if read_first:
         driver.until(lambda: driver.gpu()["stowaway_bytes"] == 4 * GIB)
         driver.advance(0.5)
