@@ -236,9 +236,7 @@ def test_14_after_a_restart_it_is_said_who_lives_and_who_has_exited(stage: Stage
     waiter.until("ready")
 
 
-def test_17_a_program_that_crashes_in_its_load_does_not_empty_the_gpu_for_each_start(
-    stage: Stage,
-) -> None:
+def test_17_a_crash_looping_load_empties_the_gpu_once(stage: Stage) -> None:
     """A supervisor starts it again at once, every time. The model that works stays, and the program
     is told the cause."""
     for _ in range(

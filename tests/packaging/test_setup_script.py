@@ -123,10 +123,10 @@ def full(project: Path) -> Path:
     script(
         project,
         "uv",
-        f'[ "$1" = --version ] && exit 0; echo "uv $*" >>{log}; case "$*" in *"--extra gstreamer"*) [ ! -e '
-        f"{project}/unbuildable ] || exit 1 ;; esac; "
-        f'[ "$1" != venv ] || {{ mkdir -p "${{@: -1}}/bin"; ln -s {sys.executable} "${{@: '
-        '-1}/bin/python"; }',
+        f'[ "$1" = --version ] && exit 0; echo "uv $*" >>{log}; '
+        f'case "$*" in *"--extra gstreamer"*) [ ! -e {project}/unbuildable ] || exit 1 ;; esac; '
+        '[ "$1" != venv ] || { mkdir -p "${@: -1}/bin"; '
+        f'ln -s {sys.executable} "${{@: -1}}/bin/python"; }}',
     )
     for tool in ("mkdir", "ln", "touch"):
         (project / "bin" / tool).symlink_to(str(shutil.which(tool)))

@@ -106,7 +106,7 @@ def begin(runner: HardwareRunner, skill: Nod, **goal: Any) -> list[SkillEnded]:
     return ended
 
 
-def test_a_skill_sees_the_cameras_and_its_actions_reach_the_motors(
+def test_a_skill_sees_cameras_and_moves_the_motors(
     started: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
 ) -> None:
     seen: list[WorldState] = []

@@ -122,7 +122,7 @@ def detections_of(hardware: HardwareRunner) -> tuple[list[str], str]:
     return labels, hardware.world.diagnostics["detector:front"]
 
 
-async def test_detections_are_in_the_world_state_until_they_are_too_old(
+async def test_detections_are_in_the_world_state_until_old(
     detector: ContinuousDetector, hardware: HardwareRunner, model: Model, clock: ManualClock
 ) -> None:
     assert detections_of(hardware) == ([], "stale")  # it has not looked yet

@@ -126,7 +126,7 @@ def history(steps: list[dict[str, Any]], at: int, length: int) -> dict[str, Any]
     return stacked([steps[max(0, place)] for place in range(at + 1 - length, at + 1)])
 
 
-def served(adapter: PolicyAdapter, steps: list[dict[str, Any]]) -> Any:
+def answered_episode(adapter: PolicyAdapter, steps: list[dict[str, Any]]) -> Any:
     """Return the actions of one episode, played as they are answered."""
     import numpy as np
     import torch

@@ -198,7 +198,7 @@ assert tracing.log_ids() == {}
 
 
 @needs_sdk
-def test_spans_and_metrics_reach_the_collector_at_the_programs_end() -> None:
+def test_spans_and_metrics_are_sent_at_the_end() -> None:
     with Collector() as collector:
         environ = {
             "OTEL_EXPORTER_OTLP_ENDPOINT": collector.endpoint,
@@ -238,7 +238,7 @@ def test_spans_and_metrics_reach_the_collector_at_the_programs_end() -> None:
 
 @needs_sdk
 @pytest.mark.parametrize(("given", "interval_ms"), [("", 5000.0), ("20000", 20000.0)])
-def test_metrics_leave_every_five_seconds_unless_the_environment_says_another(
+def test_metrics_leave_every_five_seconds(
     given: str, interval_ms: float, variables: Variables
 ) -> None:
     variables({"OTEL_METRIC_EXPORT_INTERVAL": given, "OTEL_METRICS_EXPORTER": "console"})
@@ -251,7 +251,7 @@ def test_metrics_leave_every_five_seconds_unless_the_environment_says_another(
 
 
 @needs_sdk
-def test_prometheus_is_read_on_loopback_and_not_after_the_end() -> None:
+def test_prometheus_is_read_on_loopback_until_the_end() -> None:
     port = str(free_port())
     result = run_program(
         "import http.client\n"
