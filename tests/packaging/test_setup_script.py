@@ -56,9 +56,8 @@ def test_usage(project: Path, arguments: list[str]) -> None:
 
 
 def test_without_uv_and_python_it_says_what_to_install(project: Path) -> None:
-    script(
-        project, "python3.12", "echo 'pyenv: python3.12: command not found' >&2; exit 127"
-    )  # a shim that refuses
+    # a shim that refuses
+    script(project, "python3.12", "echo 'pyenv: python3.12: command not found' >&2; exit 127")
     result = set_up(project, "core")
     assert result.returncode == 1
     assert "neither uv nor a working Python was found" in result.stderr

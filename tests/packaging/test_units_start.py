@@ -478,9 +478,8 @@ asyncio.run(load())
 def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
     """A model loads under a lease, a robot is stopped, and a task fails because of that, each as
     its unit's user."""
-    machine.run(
-        "chmod", "-R", "g+rwX", "/run/vram-arbiter/fakegpu"
-    )  # a driver serves several users
+    # a driver serves several users
+    machine.run("chmod", "-R", "g+rwX", "/run/vram-arbiter/fakegpu")
     skill = "vram_arbiter/configs/rskills/so101-progress/rskill.yaml"
     manifest = f"/opt/vram-arbiter/lib/python3*/site-packages/{skill}"
     options = f"--rskill {manifest} --device fake:/run/vram-arbiter/fakegpu"

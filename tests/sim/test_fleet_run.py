@@ -17,7 +17,9 @@ def test_two_choices_spread_what_one_view_would_heap(story: Story) -> None:
 
 def test_a_hot_model_waits_less_where_its_boxes_must_have_room() -> None:
     (hot,) = (story for story in STORIES if story.name == "hot model")
-    waited = [play_story(hot, choose, BOXES, seed=1).waited for choose in (two_choices, model_first)]
+    waited = [
+        play_story(hot, choose, BOXES, seed=1).waited for choose in (two_choices, model_first)
+    ]
     assert waited[0] < waited[1]
 
 

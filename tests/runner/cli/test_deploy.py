@@ -192,9 +192,8 @@ async def test_the_emergency_stop_of_a_real_process(deploy: Start, tmp_path: Pat
         words = ("estop", "--reason", "test", "--endpoint", client.endpoint)
         argv = [sys.executable, "-m", "vram_arbiter.runner", *words]
         said, complaint = b"", b"has not obeyed"
-        while (
-            b"has not obeyed" in complaint
-        ):  # within a second, which a busy machine may need for less
+        # within a second, which a busy machine may need for less
+        while b"has not obeyed" in complaint:
             program = await asyncio.create_subprocess_exec(
                 *argv, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
             )

@@ -328,9 +328,8 @@ def test_the_emergency_stop_comes_before_anything_else(
     runner = started(on_estop=told.append)
     skill = nod(on_step=lambda world: runner.request_estop("a hand is in the way"))
     ended = begin(runner, skill)
-    assert not tick(
-        runner, clock
-    ).action_applied  # the step that was under way is not sent any more
+    # the step that was under way is not sent any more
+    assert not tick(runner, clock).action_applied
     assert not twin.sent
     assert twin.story == ["connect", "halt"]
     assert told == ["a hand is in the way"]

@@ -174,10 +174,8 @@ async def test_an_evicted_model_sees_nothing_and_is_not_brought_back_from_standb
     await detector.look()
     model.resident, model.standby = False, True
     await detector.look()
-    assert detections_of(hardware) == (
-        [],
-        "stale",
-    )  # at once, though the last look was young enough
+    # at once, though the last look was young enough
+    assert detections_of(hardware) == ([], "stale")
     (slot,) = hardware.robot.detections
     assert "evicted" in slot.why
     clock.advance(10 * RELOAD_S)

@@ -76,17 +76,15 @@ def test_a_file_is_played_in_order_at_its_rate_and_then_ends(
         "front", "bgr8", 64, 48, 3,
     )  # fmt: skip
     for index, frame in enumerate(shelf.frames):
-        assert (
-            frame.stamp_monotonic_ns - begun_ns >= index * 20_000_000
-        )  # each at its time, never before
+        # each at its time, never before
+        assert frame.stamp_monotonic_ns - begun_ns >= index * 20_000_000
 
 
 def test_the_rate_can_be_given_and_is_kept(
     make_video: Callable[..., Path], started_reader: Reading
 ) -> None:
-    slow = make_video(
-        [10, 20, 30], fps=0.02
-    )  # two and a half minutes, longer than the wait for the end
+    # two and a half minutes, longer than the wait for the end
+    slow = make_video([10, 20, 30], fps=0.02)
     assert "over after 3 pictures" in wait_for_end(
         started_reader(reader_of(path=str(slow), fps=500.0))
     )
@@ -228,9 +226,8 @@ def test_pictures_that_waited_in_the_network_are_as_old_as_they_are(
     if stamp == "arrival":
         assert late.stamp_monotonic_ns >= begun_ns + 100 * 10**9
     else:
-        assert (
-            90 < age_s < 170
-        )  # a hundred, less the four that the stream lasts, and what this test took
+        # a hundred, less the four that the stream lasts, and what this test took
+        assert 90 < age_s < 170
         assert late.stamp_wall_ns <= clock.wall_ns() - 90 * 10**9
 
 

@@ -19,11 +19,7 @@ from tests.support.waiting import until
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.sensors import SlotReader
 from vram_arbiter.runner.sensors.factory import make_reader
-from vram_arbiter.runner.sensors.ros2_dds import (
-    dds_topic,
-    domain_of,
-    full_topic,
-)
+from vram_arbiter.runner.sensors.ros2_dds import dds_topic, domain_of, full_topic
 from vram_arbiter.runner.sensors.ros2_dds import reader_of as dds_reader_of
 from vram_arbiter.runner.sensors.ros2_image import RosImagePublisher, RosImageReader
 from vram_arbiter.runner.sensors.ros2_messages import IMAGE
@@ -169,9 +165,8 @@ def test_age_counts_from_the_header(
 ) -> None:
     reader = started_reader(reader_of(topic, max_age_ms=1_000.0, reliability="reliable"))
     publisher = node(topic, "image", "reliable")
-    old_ns = (
-        SystemClock().wall_ns() - 30 * 10**9
-    )  # a machine that has just been started has no longer past
+    # a machine that has just been started has no longer past
+    old_ns = SystemClock().wall_ns() - 30 * 10**9
     slot = reader.slot
     for _ in range(300):  # whoever has matched a reader may not yet have been matched by it
         publisher.publish(bytes(12), old_ns, **image(2, 2))
@@ -190,9 +185,8 @@ def test_age_can_count_from_the_arrival(
 ) -> None:
     reader = started_reader(reader_of(topic, stamp="arrival"))
     publisher = node(topic)
-    frame = picture_now(
-        reader, publisher, bytes(12), stamp_ns=1, **image(2, 2)
-    )  # a clock that begins with the machine
+    # a clock that begins with the machine
+    frame = picture_now(reader, publisher, bytes(12), stamp_ns=1, **image(2, 2))
     assert reader.read_latest().data == frame.data
 
 

@@ -80,9 +80,8 @@ def test_a_gap_during_recovery_begins_it_anew(aggregator: WorldStateAggregator) 
     now = START_NS
     for gap_ms in (30, 30, 150, 30):
         now += gap_ms * MS
-        aggregator.snapshot(
-            now
-        )  # the loop goes on, and sees that the second one has become too old
+        # the loop goes on, and sees that the second one has become too old
+        aggregator.snapshot(now)
         aggregator.update_image_frame(frame_at(now), now)
         assert aggregator.snapshot(now).diagnostics["front"] == "stale"
     now += 30 * MS

@@ -9,10 +9,7 @@ import pytest
 
 from tests.sidecars.adapters import backbone_policies, policies
 from tests.sidecars.adapters.policies import DIM, FRONT, ONLY_CAMERA, SIDE_PX, STATE, TASK, WRIST
-from vram_arbiter.schemas.errors import (
-    ModelError,
-    VramError,
-)
+from vram_arbiter.schemas.errors import ModelError, VramError
 from vram_arbiter.schemas.manifest import ModelFamily, RSkillManifest, parse_manifest
 from vram_arbiter.schemas.manifest.vocabulary import PROCESSOR_FAMILIES
 from vram_arbiter.schemas.sidecar import EndpointCall

@@ -34,12 +34,7 @@ from tests.sidecars.adapters.families import (
     swept,
 )
 from tests.sidecars.adapters.policies import DIM, FRONT, ONLY_CAMERA, STATE
-from vram_arbiter.schemas.errors import (
-    BadRequest,
-    ConfigError,
-    ModelError,
-    UnsupportedQuantization,
-)
+from vram_arbiter.schemas.errors import BadRequest, ConfigError, ModelError, UnsupportedQuantization
 from vram_arbiter.schemas.manifest import ModelFamily, parse_manifest
 from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.choose import make_adapter

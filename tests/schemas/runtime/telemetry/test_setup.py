@@ -204,9 +204,8 @@ def test_spans_and_metrics_are_sent_at_the_end() -> None:
             "OTEL_EXPORTER_OTLP_ENDPOINT": collector.endpoint,
             "OTEL_RESOURCE_ATTRIBUTES": "robot.model=so101-b",
         }
-        result = run_program(
-            PROGRAM, environ
-        )  # nothing is due before the end: it is the end that sends
+        # nothing is due before the end: it is the end that sends
+        result = run_program(PROGRAM, environ)
         assert (result.returncode, result.stderr) == (0, "")
         tick, sent, goal = collector.spans()
         assert [tick.name, goal.name] == ["rskill.tick", "rskill.goal"]
