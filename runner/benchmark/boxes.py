@@ -1,5 +1,5 @@
 """Seeds played on the boxes of a Ray cluster: each worker is an actor, with the arbiter, the
-sidecars and the files of its box. Placement, deadlines and what is played again are `clients.ray`'s.
+sidecars and the files of its box. Placement, deadlines and replays are those of `clients.ray`.
 """
 
 from __future__ import annotations

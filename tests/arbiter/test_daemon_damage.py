@@ -82,9 +82,8 @@ def test_a_damaged_journal_grants_nothing_beside_a_holder_in_use(damage: str) ->
         arbiter.start()
         database = arbiter.state / "journal.sqlite"
         with holder_in_use(arbiter) as holder:
-            holder.process.send_signal(
-                signal.SIGSTOP
-            )  # it cannot tell the next daemon what the journal does not
+            # it cannot tell the next daemon what the journal does not
+            holder.process.send_signal(signal.SIGSTOP)
             arbiter.kill()
             DAMAGES[damage](database)
             arbiter.start()

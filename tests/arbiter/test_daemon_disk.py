@@ -132,9 +132,8 @@ def test_a_full_disk_blocks_grants_and_nothing_else(
         assert client.ask("ready", **goes_on)["ok"]
         disk.fill()
         answer = client.acquire("refused", GIB)
-        refused = (
-            answer if not answer["ok"] else client.push("denied")
-        )  # it waited for a reading of the GPU
+        # it waited for a reading of the GPU
+        refused = answer if not answer["ok"] else client.push("denied")
         assert refused["error"]["code"] == "journal_unavailable"
         assert any(
             "journal cannot be written" in problem for problem in client.ask("status")["problems"]
@@ -148,9 +147,8 @@ def test_a_full_disk_blocks_grants_and_nothing_else(
 
         assert client.ask("unloading", **goes_on)["ok"]
         assert client.ask("release", **goes_on)["ok"]
-        wait_until(
-            client, lambda: consumers(client) == ["stays"]
-        )  # its record could not be deleted
+        # its record could not be deleted
+        wait_until(client, lambda: consumers(client) == ["stays"])
 
         disk.free()
         wait_until(client, lambda: client.ask("status")["problems"] == [])

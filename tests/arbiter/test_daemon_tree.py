@@ -185,9 +185,7 @@ def test_the_bytes_of_a_cgroup_are_those_of_the_lease_that_names_it(
         gpu_when(watcher, lambda gpu: gpu["stowaway_bytes"] == 4 * GIB)
         holder = ending.enter_context(
             subprocess.Popen(
-                [*python, HOLDER, f"/{cgroup.relative_to(root)}"],
-                env=quick_reader.environ,
-                **pipes,
+                [*python, HOLDER, f"/{cgroup.relative_to(root)}"], env=quick_reader.environ, **pipes
             )
         )
         assert holder.stdout is not None

@@ -115,9 +115,8 @@ def test_a_stuck_part_stops_feeding_it_and_the_manager_learns_where(
             }
             assert holder.ask("ready", lease_id=kept["lease_id"], token=kept["token"])["ok"]
             trigger.send("acquire", nonce="n", spec=spec)
-        writer = os.open(
-            pipe, os.O_WRONLY
-        )  # returns once the daemon stands at the other end: it is stuck now
+        # returns once the daemon stands at the other end: it is stuck now
+        writer = os.open(pipe, os.O_WRONLY)
         assert not feed(arbiter.heard(2 * WATCHDOG_S))
         assert arbiter.process is not None
         arbiter.process.send_signal(signal.SIGABRT)  # what systemd does after WatchdogSec

@@ -38,9 +38,8 @@ class Bench:
         self.queued: list[tuple[ClientId, LeaseId]] = []
         self.samples: dict[str, list[float]] = {}
         clients = [ClientId(f"{n:04x}") for n in range((leases + 2 * waiters) // PER_CLIENT + 4)]
-        holders = (
-            leases // PER_CLIENT + 1
-        )  # whoever waits holds nothing: nobody stands in his own way
+        # whoever waits holds nothing: nobody stands in his own way
+        holders = leases // PER_CLIENT + 1
         for number, client in enumerate(clients):
             process = ProcessKey(1000 + number, 1)
             self.handle(ev.ClientConnected(client, process, 0, f"c{number}", f"i{number}"))

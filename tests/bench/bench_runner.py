@@ -444,10 +444,8 @@ def _program(
     """`python -m WORDS` in the daemon's runtime folder. What it said is shown when anything goes
     wrong."""
     log = daemon.runtime / f"{name}.log"
-    environ = daemon.environ | {
-        "HF_HUB_OFFLINE": "1",
-        "OMP_NUM_THREADS": "1",
-    }  # as the demo starts them
+    # as the demo starts them
+    environ = daemon.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
     with log.open("ab") as sink:
         process = subprocess.Popen(
             [sys.executable, "-m", *words], cwd=ROOT, env=environ, stdout=sink, stderr=sink

@@ -19,7 +19,7 @@ from tests.bench.tunnel import tunnel_rows
 from tests.e2e.test_guests import policy_server, seconds_until_the_grant, uses
 from tests.support.boxes import Box, Boxes
 from tests.support.episodes import Bare, BareAsync, Caller, CallerAsync, SmallPlayer
-from tests.support.guests import server
+from tests.support.guests import sshd_server
 from tests.support.process import ArbiterProcess
 from tests.support.sshd import unavailable
 from tests.support.waiting import until
@@ -52,7 +52,9 @@ def boxes_of(nodes: int) -> Iterator[tuple[Boxes, Fleet]]:
             yield boxes, fleet
 
 
-def started(fleet: Fleet, box: Box, cls: type, *arguments: object, per_node: int = 1) -> list[Any]:
+def actors_of(
+    fleet: Fleet, box: Box, cls: type, *arguments: object, per_node: int = 1
+) -> list[Any]:
     """Actors of a box, loaded if they are leased."""
     import ray
 
@@ -75,7 +77,7 @@ def calls(suite: Suite) -> None:
     with boxes_of(1) as (boxes, fleet):
         (box,) = boxes.nodes
         for kind, (bare, leased, at_most_ms) in CALLS.items():
-            (actor,), (leased_actor,) = started(fleet, box, bare), started(fleet, box, leased)
+            (actor,), (leased_actor,) = actors_of(fleet, box, bare), actors_of(fleet, box, leased)
             actors = {"bare": actor, "leased": leased_actor}
             for name, apart_s, rounds in (("", 0.0, 2000), (", 50 ms apart", APART_S, 200)):
                 timed = {one: call(actor, apart_s) for one, actor in actors.items()}
@@ -94,7 +96,7 @@ def scaling(suite: Suite) -> None:
         tempfile.TemporaryDirectory(prefix="b") as folder,
     ):
         players = [
-            started(fleet, box, SmallPlayer, folder, EPISODE_S, per_node=PER_NODE)
+            actors_of(fleet, box, SmallPlayer, folder, EPISODE_S, per_node=PER_NODE)
             for box in boxes.nodes
         ]
         for nodes in (1, *SCALING):
@@ -128,7 +130,7 @@ def played(
 
 def node_death(suite: Suite) -> None:
     with boxes_of(2) as (boxes, fleet), tempfile.TemporaryDirectory(prefix="b") as folder:
-        spread = [started(fleet, box, SmallPlayer, folder, EPISODE_S) for box in boxes.nodes]
+        spread = [actors_of(fleet, box, SmallPlayer, folder, EPISODE_S) for box in boxes.nodes]
         actors = [actor for (actor,) in spread]
         killed_at = 0.0
 
@@ -155,7 +157,7 @@ def bytes_back(suite: Suite) -> None:
         FakeGpu(box.gpu_folder).edit(release_lag_s=0.0)
         with Client("bench", endpoint=box.daemon.endpoint) as arbiter:
             for _ in range(suite.size(5, 2)):
-                (actor,) = started(fleet, box, SmallPlayer, folder, 0.0)
+                (actor,) = actors_of(fleet, box, SmallPlayer, folder, 0.0)
                 began = time.monotonic()
                 ray.kill(actor)
                 until(lambda: not arbiter.status().leases)
@@ -174,7 +176,7 @@ def silent_network(suite: Suite) -> None:
             return daemon
 
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="b"))
-        there = stack.enter_context(server(make, Path(folder), network=True))
+        there = stack.enter_context(sshd_server(make, Path(folder), network=True))
         policy, lease = stack.enter_context(policy_server(there))
         _, endpoint = stack.enter_context(there.tunnel())
         robot = stack.enter_context(Client("arm1", endpoint=endpoint))

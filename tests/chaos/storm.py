@@ -111,9 +111,8 @@ class Storm:
         self._disk_is_full = False
         self._wall_minus_monotonic_s = time.time() - time.monotonic()
         self._findings: list[Finding] = []
-        self._plan: list[
-            tuple[str, str, str]
-        ] = []  # what is still to be done of this turn: step, role, signal
+        # what is still to be done of this turn: step, role, signal
+        self._plan: list[tuple[str, str, str]] = []
 
     # -- the run
     async def run(self) -> dict[str, Any]:

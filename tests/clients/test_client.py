@@ -460,9 +460,8 @@ async def test_subscribers_see_events_in_order(
         await lease.release()
         async with within(PATIENCE_S):
             await following
-        kinds = [
-            kind for kind in kinds if kind != "queued"
-        ]  # where the first reading of the GPU is still under way
+        # where the first reading of the GPU is still under way
+        kinds = [kind for kind in kinds if kind != "queued"]
         assert kinds == ["granted", "ready", "switch", "released"]
         assert [event["kind"] for event in (await client.history(kinds=["granted"])).events] == [
             "granted"

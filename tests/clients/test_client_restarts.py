@@ -37,9 +37,8 @@ async def test_a_restart_of_the_daemon_is_ridden_out(
         assert process is not None
         process.kill()
         process.wait()
-        await until(
-            lambda: not client.connected
-        )  # the socket's monitor says so, no heartbeat has to run out
+        # the socket's monitor says so, no heartbeat has to run out
+        await until(lambda: not client.connected)
         asked = beside(client.status())
         await anyio.to_thread.run_sync(arbiter.start)
         await until(lambda: client.connected and client.epoch > pinned.token[0])

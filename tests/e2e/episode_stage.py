@@ -176,9 +176,8 @@ class Stage:
             await asyncio.sleep(0.02)
         listening = asyncio.create_task(stage._listen())
         stack.callback(listening.cancel)
-        while (
-            not stage.events
-        ):  # subscribed: a use of nobody's is refused, a ping is not told; a look is
+        # subscribed: a use of nobody's is refused, a ping is not told; a look is
+        while not stage.events:
             await stage.detector.detect(b"\x89PNG\r\n\x1a\n", "cube")
             await asyncio.sleep(0.02)
         stage.events.clear()

@@ -283,9 +283,8 @@ async def one_after_the_other(stage: Stage) -> None:
         held = await policy.ping(timeout_s=WAIT_S)
         assert held["token"] is not None
         await stack.enter_async_context(stage.arbiter.use(held["lease_id"], held["token"]))
-        stage.programs.tell(
-            "hold", False
-        )  # from one use to the next: no moment in which it could be idle
+        # from one use to the next: no moment in which it could be idle
+        stage.programs.tell("hold", False)
         await call
         for prompt in ("hold still", "go on holding still"):
             goal = await stage.runner.send_goal(SKILL, prompt=prompt, deadline_s=DEADLINE_S)

@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.guests import USER, Server, server
+from tests.support.guests import USER, Server, sshd_server
 from tests.support.process import Make
 from tests.support.waiting import until
 from tests.support.wire import WireClient
@@ -95,7 +95,7 @@ def seconds_until_the_grant(
 
 def test_a_guest_through_ssh_uses_and_holds_nothing(make_arbiter: Make, tmp_path: Path) -> None:
     with (
-        server(make_arbiter, tmp_path) as there,
+        sshd_server(make_arbiter, tmp_path) as there,
         policy_server(there) as (policy, lease),
         there.tunnel() as (ssh, endpoint),
         Client("arm1", endpoint=endpoint) as robot,
@@ -138,7 +138,7 @@ def test_a_use_ends_with_the_tunnel_or_the_network(
     """sshd 9.2 gave a silent client up after 8 s, and not in 30 while it had something to send: the
     robot subscribes, and there is always an event to send."""
     with (
-        server(make_arbiter, tmp_path, network=True) as there,
+        sshd_server(make_arbiter, tmp_path, network=True) as there,
         policy_server(there) as (policy, lease),
         events_flow(there),
         there.tunnel() as (ssh, endpoint),
@@ -159,7 +159,7 @@ def test_a_use_ends_with_the_robots_program(make_arbiter: Make, tmp_path: Path) 
     """The tunnel lives on. A program that ends is noticed at once, one that is frozen by its
     silence."""
     with (
-        server(make_arbiter, tmp_path) as there,
+        sshd_server(make_arbiter, tmp_path) as there,
         policy_server(there) as (policy, lease),
         there.tunnel() as (_, endpoint),
     ):
@@ -177,7 +177,7 @@ def test_a_use_ends_with_the_robots_program(make_arbiter: Make, tmp_path: Path) 
 def test_a_robot_that_comes_back_uses_anew(make_arbiter: Make, tmp_path: Path) -> None:
     """Its old use is lost, with the reason; the session and the tunnel are the same."""
     with (
-        server(make_arbiter, tmp_path, network=True) as there,
+        sshd_server(make_arbiter, tmp_path, network=True) as there,
         policy_server(there) as (policy, lease),
         there.tunnel() as (ssh, endpoint),
         Client("arm1", endpoint=endpoint) as robot,
@@ -199,7 +199,7 @@ def test_a_robot_that_comes_back_uses_anew(make_arbiter: Make, tmp_path: Path) -
 def test_a_guests_use_outlives_the_daemon(make_arbiter: Make, tmp_path: Path) -> None:
     """The journal names sshd's process, and the robot says its use again through the tunnel."""
     with (
-        server(make_arbiter, tmp_path) as there,
+        sshd_server(make_arbiter, tmp_path) as there,
         policy_server(there) as (policy, lease),
         there.tunnel() as (_, endpoint),
         Client("arm1", endpoint=endpoint) as robot,
@@ -218,7 +218,7 @@ def test_a_guests_use_outlives_the_daemon(make_arbiter: Make, tmp_path: Path) ->
 def test_guests_do_not_end_each_others_uses(make_arbiter: Make, tmp_path: Path) -> None:
     users = (USER, "arm2")
     with (
-        server(make_arbiter, tmp_path, users) as there,
+        sshd_server(make_arbiter, tmp_path, users) as there,
         policy_server(there) as (policy, lease),
         there.tunnel(USER) as (_, one),
         there.tunnel("arm2") as (_, two),
@@ -262,7 +262,7 @@ def test_an_installed_key_is_that_of_a_user_in_both_groups(tmp_path: Path) -> No
 def test_an_authorized_key_opens_what_its_line_names(make_arbiter: Make, tmp_path: Path) -> None:
     """What sshd does, not what its manual says: it compares paths of sockets with `permitopen`."""
     users = (USER, "arm2")
-    with server(make_arbiter, tmp_path, users) as there, ExitStack() as stack:
+    with sshd_server(make_arbiter, tmp_path, users) as there, ExitStack() as stack:
         runtime = there.arbiter.runtime
         doors = [stack.enter_context(greeting(socket.AF_INET, ("127.0.0.1", 0))) for _ in "ab"]
         ports = [door.getsockname()[1] for door in doors]
@@ -282,7 +282,7 @@ def test_an_authorized_key_opens_what_its_line_names(make_arbiter: Make, tmp_pat
 
 @pytest.mark.nightly
 def test_nothing_but_forwarding(make_arbiter: Make, tmp_path: Path) -> None:
-    with server(make_arbiter, tmp_path) as there:
+    with sshd_server(make_arbiter, tmp_path) as there:
         for arguments in (["id"], ["-tt"], ["-s", "sftp"], []):
             with there.ssh(*arguments) as ssh:
                 assert ssh.wait(PATIENCE_S) != 0

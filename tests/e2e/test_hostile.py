@@ -163,9 +163,8 @@ def test_thousands_of_forged_frames_are_answered_one_by_one(
     """Valid requests, mutants and noise, with the honest one's lease and token among them."""
     forger = Forger(random.Random(5))
     forger.lease_ids += [honest.on["lease_id"], "honest"]
-    liar = connect().hello(
-        "liar", role="observer"
-    )  # an observer can change nothing, whatever it knows
+    # an observer can change nothing, whatever it knows
+    liar = connect().hello("liar", role="observer")
     for number in range(1500):
         frame = forger.frame() if number % 2 else msgpack.packb(forger.request(id=number))
         if len(frame) > LARGE_BYTES:

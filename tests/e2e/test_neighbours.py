@@ -205,9 +205,8 @@ def test_13_a_second_authority_on_the_same_gpu_does_not_give_away_what_the_first
         with WireClient(other.endpoint) as client:
             assert client.hello("elsewhere").acquire("elsewhere", 5 * GIB)["state"] == "queued"
             while not (seen := client.ask("status"))["gpus"][0]["stowaway_bytes"]:
-                client.receive(
-                    0.02
-                )  # it has just started: its first reading of the GPU may be under way
+                # it has just started: its first reading of the GPU may be under way
+                client.receive(0.02)
             assert seen["gpus"][0]["stowaway_bytes"] == 5 * GIB
             assert [lease["state"] for lease in seen["leases"]] == ["queued"]
     finally:
@@ -236,14 +235,11 @@ def test_14_after_a_restart_it_is_said_who_lives_and_who_has_exited(stage: Stage
     waiter.until("ready")
 
 
-def test_17_a_program_that_crashes_in_its_load_does_not_empty_the_gpu_for_each_start(
-    stage: Stage,
-) -> None:
+def test_17_a_crash_looping_load_empties_the_gpu_once(stage: Stage) -> None:
     """A supervisor starts it again at once, every time. The model that works stays, and the program
     is told the cause."""
-    for _ in range(
-        8
-    ):  # after that it is refused for a minute: however slowly the rest of this goes, it is
+    # after that it is refused for a minute: however slowly the rest of this goes, it is
+    for _ in range(8):
         start = stage.spawn("crashes", 5, slow=True)
         start.until("loading")
         start.kill()

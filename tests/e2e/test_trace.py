@@ -185,9 +185,8 @@ def judge(trace: Trace, collector: Collector) -> None:
     assert tool.attributes[telemetry.ATTR_TOOL] == "execute_rskill"
     assert goal.attributes[telemetry.ATTR_SKILL] == "vram-arbiter/so101-grab"
     assert goal.attributes[telemetry.ATTR_OUTCOME] == "canceled", "the reasoner took it with itself"
-    plans = trace.below(
-        turn, telemetry.SPAN_PLAN
-    )  # several where news came meanwhile, as of a picture that is late
+    # several where news came meanwhile, as of a picture that is late
+    plans = trace.below(turn, telemetry.SPAN_PLAN)
     assert "execute_rskill" in [plan.attributes[telemetry.ATTR_OUTCOME] for plan in plans]
 
     chats = [chat for plan in plans for chat in trace.below(plan, "chat m")]
@@ -196,9 +195,8 @@ def judge(trace: Trace, collector: Collector) -> None:
 
     look, _ = trace.below(task, telemetry.SPAN_REASONER_TICK)
     (seen,) = trace.below(look, telemetry.SPAN_TOOL)
-    detect, *again = trace.below(
-        seen, telemetry.SPAN_SIDECAR_REQUEST
-    )  # again if it loads longer than a picture is good
+    # again if it loads longer than a picture is good
+    detect, *again = trace.below(seen, telemetry.SPAN_SIDECAR_REQUEST)
     assert {span.service for span in (detect, *again)} == {DETECTOR}
     assert (again or [detect])[-1].attributes[telemetry.ATTR_OUTCOME] == "ok"
     assert [span.service for span in trace.below(detect, telemetry.SPAN_SIDECAR_LOAD)] == [DETECTOR]

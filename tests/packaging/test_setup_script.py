@@ -56,9 +56,8 @@ def test_usage(project: Path, arguments: list[str]) -> None:
 
 
 def test_without_uv_and_python_it_says_what_to_install(project: Path) -> None:
-    script(
-        project, "python3.12", "echo 'pyenv: python3.12: command not found' >&2; exit 127"
-    )  # a shim that refuses
+    # a shim that refuses
+    script(project, "python3.12", "echo 'pyenv: python3.12: command not found' >&2; exit 127")
     result = set_up(project, "core")
     assert result.returncode == 1
     assert "neither uv nor a working Python was found" in result.stderr
@@ -123,10 +122,10 @@ def full(project: Path) -> Path:
     script(
         project,
         "uv",
-        f'[ "$1" = --version ] && exit 0; echo "uv $*" >>{log}; case "$*" in *"--extra gstreamer"*) [ ! -e '
-        f"{project}/unbuildable ] || exit 1 ;; esac; "
-        f'[ "$1" != venv ] || {{ mkdir -p "${{@: -1}}/bin"; ln -s {sys.executable} "${{@: '
-        '-1}/bin/python"; }',
+        f'[ "$1" = --version ] && exit 0; echo "uv $*" >>{log}; '
+        f'case "$*" in *"--extra gstreamer"*) [ ! -e {project}/unbuildable ] || exit 1 ;; esac; '
+        '[ "$1" != venv ] || { mkdir -p "${@: -1}/bin"; '
+        f'ln -s {sys.executable} "${{@: -1}}/bin/python"; }}',
     )
     for tool in ("mkdir", "ln", "touch"):
         (project / "bin" / tool).symlink_to(str(shutil.which(tool)))

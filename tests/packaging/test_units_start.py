@@ -122,7 +122,7 @@ for endpoint in sys.stdin:
 interpreter for each look takes 0.3 s of a core."""
 
 
-def answer_of[T](found: Callable[[], T | None], what: Callable[[], str]) -> T:
+def first_answer[T](found: Callable[[], T | None], what: Callable[[], str]) -> T:
     """Ask until there is an answer: what happens inside the machine shows from outside only."""
     deadline = time.monotonic() + PATIENCE_S
     while (answer := found()) is None:
@@ -147,7 +147,7 @@ def held_inside(
     """A program that runs under a lease."""
     command = ["vramctl", "run", "--endpoint", ENDPOINT, "--name", name, "--vram", "1GiB", *options]
     process = subprocess.Popen(machine.inside(*command, "--", "sleep", "1000", user=user))
-    lease = answer_of(
+    lease = first_answer(
         lambda: (leases_inside(machine) or {}).get(name), lambda: machine.log(ARBITER)
     )
     try:
@@ -168,7 +168,7 @@ def hit(machine: Machine, name: str) -> None:
         restarts, state = machine.show(ARBITER, "NRestarts", "ActiveState")
         return True if [restarts] != before and state == "active" else None
 
-    answer_of(again, lambda: machine.log(ARBITER) + machine.console)
+    first_answer(again, lambda: machine.log(ARBITER) + machine.console)
 
 
 def test_each_group_may_do_its_part(machine: Machine) -> None:
@@ -194,7 +194,7 @@ def test_each_group_may_do_its_part(machine: Machine) -> None:
 def test_a_killed_arbiter_comes_back_with_its_leases(machine: Machine) -> None:
     with held_inside(machine, "survivor") as before:
         hit(machine, "KILL")
-        after = answer_of(
+        after = first_answer(
             lambda: (leases_inside(machine) or {}).get("survivor"), lambda: machine.log(ARBITER)
         )
         assert (after["lease_id"], after["pid"]) == (before["lease_id"], before["pid"])
@@ -220,7 +220,7 @@ def test_hooks_run_as_their_page_says(machine: Machine) -> None:
         return {json.loads(line)["consumer"] for line in lines.splitlines()}
 
     def granted_to(name: str) -> None:
-        answer_of(
+        first_answer(
             lambda: True if name in seen() else None, lambda: machine.log("vram-observer.service")
         )
 
@@ -237,7 +237,7 @@ def test_hooks_run_as_their_page_says(machine: Machine) -> None:
         said = machine.read("/var/lib/vram-observer/no")
         return "operators' group may be operator" in said or None
 
-    answer_of(refused, lambda: machine.log("vram-observer.service"))
+    first_answer(refused, lambda: machine.log("vram-observer.service"))
     machine.run("systemctl", "disable", "--now", "vram-observer")
 
 
@@ -245,7 +245,7 @@ def test_the_watchdog_ends_an_arbiter_that_hangs(machine: Machine) -> None:
     with held_inside(machine, "patient") as before:
         hit(machine, "STOP")
         assert "Fatal Python error: Aborted" in machine.log(ARBITER), "where it hung, is said"
-        after = answer_of(
+        after = first_answer(
             lambda: (leases_inside(machine) or {}).get("patient"), lambda: machine.log(ARBITER)
         )
         assert (after["lease_id"], after["pid"]) == (before["lease_id"], before["pid"])
@@ -254,7 +254,7 @@ def test_the_watchdog_ends_an_arbiter_that_hangs(machine: Machine) -> None:
 def test_a_mistake_in_the_configuration_is_not_tried_again(machine: Machine) -> None:
     machine.write("/etc/vram-arbiter/arbiter.yaml", "gpu:\n  reserv_bytes: 1GiB\n")
     machine.run("systemctl", "reload", ARBITER)
-    answer_of(
+    first_answer(
         lambda: "config_refused" in machine.log(ARBITER) or None, lambda: machine.log(ARBITER)
     )
     status = machine.run("vramctl", "status", "--endpoint", ENDPOINT)
@@ -376,7 +376,7 @@ def test_the_unit_of_a_tunnel_keeps_it_and_gives_a_refused_one_up(machine: Machi
                 now, (said,) = sessions(), shown("StatusText")
                 return True if now and not now & before and "is up" in said else None
 
-            answer_of(again, log)
+            first_answer(again, log)
 
         as_user("systemctl", "--user", "start", TUNNEL)
         (tunnel,) = json.loads(as_user("vramctl", "remote", "status", "--json"))["tunnels"]
@@ -389,7 +389,7 @@ def test_the_unit_of_a_tunnel_keeps_it_and_gives_a_refused_one_up(machine: Machi
 
         machine.run("rm", f"/etc/ssh/vram-guests/{ROBOT}")
         machine.run("kill", "-KILL", *sessions())
-        answer_of(lambda: True if shown("ActiveState") == ["failed"] else None, log)
+        first_answer(lambda: True if shown("ActiveState") == ["failed"] else None, log)
         assert shown("ExecMainStatus", "NRestarts") == ["1", "10"], "the eleventh start is none"
         assert log().count("refuses the tunnel") == 9
         assert "on the server: `vramctl remote authorize`" in log()
@@ -437,19 +437,19 @@ def test_setup_puts_a_unit_under_a_lease_which_stops_and_starts_it(machine: Mach
     def log() -> str:
         return machine.log(SERVED) + machine.log(GATEWAY)
 
-    answer_of(lambda: read()[1] or None, log)
+    first_answer(lambda: read()[1] or None, log)
     setup = ("/opt/vram-arbiter/bin/vram-gateway", "setup", "--endpoint", ENDPOINT)
     said = machine.run(*setup).splitlines()
     port, key = said[1].rpartition(":")[2], said[3].partition("=")[2]
 
-    leases, process = answer_of(
+    leases, process = first_answer(
         lambda: found if (found := read())[1].get("lease_ids") else None, log
     )
     assert leases[0]["consumer"] == "llm"
     assert (process["used_bytes"], process["stowaway"]) == (3 << 30, False)
     assert process["lease_ids"] == [leases[0]["lease_id"]]
     machine.run("vramctl", "evict", "llm", "-r", "a test", "--endpoint", ENDPOINT)
-    answer_of(lambda: True if read() == ([], {}) else None, log)
+    first_answer(lambda: True if read() == ([], {}) else None, log)
     assert machine.show(SERVED, "ActiveState") == ["inactive"]
     assert '"id": "llm"' in machine.run("bash", "-c", ASK, "bash", port, key), log()
     assert [one["consumer"] for one in read()[0]] == ["llm"]
@@ -478,9 +478,8 @@ asyncio.run(load())
 def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
     """A model loads under a lease, a robot is stopped, and a task fails because of that, each as
     its unit's user."""
-    machine.run(
-        "chmod", "-R", "g+rwX", "/run/vram-arbiter/fakegpu"
-    )  # a driver serves several users
+    # a driver serves several users
+    machine.run("chmod", "-R", "g+rwX", "/run/vram-arbiter/fakegpu")
     skill = "vram_arbiter/configs/rskills/so101-progress/rskill.yaml"
     manifest = f"/opt/vram-arbiter/lib/python3*/site-packages/{skill}"
     options = f"--rskill {manifest} --device fake:/run/vram-arbiter/fakegpu"
@@ -498,7 +497,7 @@ def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
         raise AssertionError(machine.log(f"{sidecar}.service")) from error
     assert set(leases_inside(machine) or {}) == {"reward"}
 
-    answer_of(
+    first_answer(
         lambda: True if "runner.sock" in machine.run("ls", "/run/vram-arbiter").split() else None,
         lambda: machine.log(f"{runner}.service"),
     )
@@ -509,7 +508,7 @@ def test_sidecar_runner_and_reasoner_start_beside_it(machine: Machine) -> None:
     assert "a guest may not use runner" in said
     machine.run("vram-runner", "estop", "--reason", "a test", user="vram-robot")
     machine.start(reasoner)
-    answer_of(
+    first_answer(
         lambda: True if machine.show(reasoner, "ActiveState") == ["failed"] else None,
         lambda: machine.log(f"{reasoner}.service"),
     )
@@ -572,7 +571,7 @@ def test_an_upgrade_keeps_leases_and_files_of_the_operator(machine: Machine) -> 
         machine.run("systemctl", "restart", ARBITER)
         for held in (first, second):
             name = held["consumer"]
-            after = answer_of(
+            after = first_answer(
                 lambda name=name: (leases_inside(machine) or {}).get(name),
                 lambda: machine.log(ARBITER),
             )

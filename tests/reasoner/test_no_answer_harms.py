@@ -180,7 +180,7 @@ ARGUMENTS: dict[str, st.SearchStrategy[dict[str, Any]]] = {
 
 
 @st.composite
-def calls(draw: st.DrawFn) -> Call:
+def planner_calls(draw: st.DrawFn) -> Call:
     if draw(st.integers(0, 4)) == 0:  # a skill's own function
         rskill = draw(SKILLS)
         fields = draw(
@@ -199,8 +199,8 @@ def calls(draw: st.DrawFn) -> Call:
     return Call("c", name, draw(ARGUMENTS[name]))
 
 
-ANSWERS = st.builds(Answer, TEXT, st.lists(calls(), min_size=0, max_size=2).map(tuple))
-GOOD = st.builds(lambda call: Answer("", (call,)), calls())
+ANSWERS = st.builds(Answer, TEXT, st.lists(planner_calls(), min_size=0, max_size=2).map(tuple))
+GOOD = st.builds(lambda call: Answer("", (call,)), planner_calls())
 
 
 @settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))

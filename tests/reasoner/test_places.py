@@ -18,9 +18,8 @@ def test_scores_of_one_place_add_up_over_looks_from_different_places() -> None:
     object every time."""
     places = Places()
     places.add(look([0.0, 0.0, 0.0], (1.0, 0.0, 0.6), (1.0, 0.5, 0.7)))
-    places.add(
-        look([1.0, -0.5, math.pi / 2], (0.51, 0.02, 0.5))
-    )  # the first again, seen from the side
+    # the first again, seen from the side
+    places.add(look([1.0, -0.5, math.pi / 2], (0.51, 0.02, 0.5)))
     best = places.best()
     assert best is not None
     assert best.score == pytest.approx(1.1)

@@ -92,10 +92,7 @@ class Room:
     def _from_base(self, at: Point) -> Point:
         x, y, yaw = self.base
         dx, dy = at[0] - x, at[1] - y
-        return (
-            dx * math.cos(yaw) + dy * math.sin(yaw),
-            dy * math.cos(yaw) - dx * math.sin(yaw),
-        )
+        return (dx * math.cos(yaw) + dy * math.sin(yaw), dy * math.cos(yaw) - dx * math.sin(yaw))
 
     def _fall(self) -> None:
         """The target falls, out of the hand as well, and rolls."""

@@ -51,10 +51,7 @@ def saying(look: Told = FOUND, answer: Told = YES, grab: Told = DONE, other: Tol
 
 
 def run_script(
-    world: World,
-    palette: Palette = PALETTE,
-    hand: str | None = None,
-    sight: Sight | None = None,
+    world: World, palette: Palette = PALETTE, hand: str | None = None, sight: Sight | None = None
 ) -> tuple[Result, list[ToolCall]]:
     """Run the script against a world that answers (call, how many calls of this tool came
     before). The hand is empty at first; with `hand` the world says what is in it.

@@ -125,9 +125,8 @@ def test_patience_counts_motion_and_not_the_wait_for_the_gpu(a_runner: Any) -> N
 
     async def loads(runner: Any) -> None:
         await runner.feed(0.0, "acquiring")
-        await asyncio.sleep(
-            0.6
-        )  # twice the patience: what is tested is that time passes without a cancel
+        # twice the patience: what is tested is that time passes without a cancel
+        await asyncio.sleep(0.6)
         await runner.end()
 
     outcome, cancelled = play(lambda: story(patient, loads))

@@ -65,9 +65,8 @@ class KinematicEnv:
             raise ValueError("the physics blew up")
         self.steps.append((arm_target, base_velocity))
         if arm_target is not None:
-            self.joints = {
-                name: arm_target[name] for name in JOINTS
-            }  # all of them, as the simulator wants it
+            # all of them, as the simulator wants it
+            self.joints = {name: arm_target[name] for name in JOINTS}
         vx, vy, wz = base_velocity or (0.0, 0.0, 0.0)
         x, y, yaw = self.base
         cos, sin = math.cos(yaw), math.sin(yaw)

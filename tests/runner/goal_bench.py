@@ -59,9 +59,8 @@ class Told(SkillBase):
                 raise Evicted("another model is there")
             case "defect":
                 raise ZeroDivisionError("oops")
-        row = (
-            0.01 * (self.steps % 20),
-        ) * 2  # to and fro within the joints' ranges: "forever" is as long as a test is
+        # to and fro within the joints' ranges: "forever" is as long as a test is
+        row = (0.01 * (self.steps % 20),) * 2
         names = ("shoulder_pan", "wrist_roll")
         if self.steps % 2:
             return Hold("thinking")

@@ -19,9 +19,7 @@ from vram_arbiter.schemas.wire.views import LeaseView
 pytestmark = pytest.mark.anyio
 
 
-async def test_rendering_holds_a_small_pinned_lease_on_the_arbiters_gpu_and_on_no_other(
-    arbiter_daemon: ArbiterProcess,
-) -> None:
+async def test_rendering_holds_a_small_pinned_lease(arbiter_daemon: ArbiterProcess) -> None:
     async with AsyncClient("runner", endpoint=arbiter_daemon.endpoint) as client:
 
         async def leases() -> list[LeaseView]:

@@ -183,7 +183,7 @@ class TestQuantizedLinear:
         ("int4", {"compute_dtype": "float16"}, (6, 0)),
     ],
 )
-def test_a_gpu_that_cannot_compute_in_the_number_format_is_refused(
+def test_a_gpu_without_the_number_format_is_refused(
     monkeypatch: pytest.MonkeyPatch, dtype: str, extra: dict[str, Any], needs: tuple[int, int]
 ) -> None:
     """Regression: torch emulates bf16 on such a GPU, many times slower."""

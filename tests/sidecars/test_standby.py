@@ -37,7 +37,7 @@ def sent_away(box, arbiter):
     return detector, policy
 
 
-def test_it_comes_back_by_itself_when_the_one_that_it_left_for_has_gone(box, arbiter):
+def test_it_returns_when_its_evictor_has_gone(box, arbiter):
     detector, policy = sent_away(box, arbiter)
     identity = detector.ask("ping")
     assert (identity["state"], identity["standby"], identity["token"]) == ("unloaded", True, None)

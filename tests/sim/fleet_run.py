@@ -86,8 +86,8 @@ STORIES: Final = (
     Story("herd", placements=0.2, herd=True),
     Story("hot herd", placements=0.2, herd=True, hot=1.0),
 )
-"""`asked`: a driver asks 1,000 agents within half a second (measured: 0.5 ms each). `boards`: agents
-would push their views to BOARDS actors each second."""
+"""`asked`: a driver asks 1,000 agents within half a second (measured: 0.5 ms each). `boards`:
+agents would push their views to BOARDS actors each second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,7 @@ def _strict(one: Ranked) -> tuple[int, int, int, str]:
     return list(Reason).index(one.reason), one.waiting, -(one.free_bytes or 0), one.node
 
 
-def play(story: Story, choose: Choose, boxes: int, seed: int) -> Outcome:
+def play_story(story: Story, choose: Choose, boxes: int, seed: int) -> Outcome:
     rng = Random(seed)
     fleet = {
         f"{number:04d}": Box(f"{number:04d}", rng.choice((8, 12, 16, 24)) * GIB)
@@ -191,11 +191,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     for story in STORIES:
         for name, choose in POLICIES.items():
             begun = time.perf_counter()
-            told = play(story, choose, args.boxes, args.seed)
+            told = play_story(story, choose, args.boxes, args.seed)
             took = time.perf_counter() - begun
-            print(
-                f"{story.name:18}{name:14}{told.most:14}{told.waited:9.1%}{told.warm:8.1%}{took:7.1f}"
-            )
+            figures = f"{told.most:14}{told.waited:9.1%}{told.warm:8.1%}{took:7.1f}"
+            print(f"{story.name:18}{name:14}{figures}")
     return 0
 
 

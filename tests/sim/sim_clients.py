@@ -142,9 +142,8 @@ class Cast:
     world: World
     asks: list[Ask] = field(default_factory=list)
     holdings: dict[str, Holding] = field(default_factory=dict)
-    uses: dict[str, dict[str, tuple[SimProcess, int | None]]] = field(
-        default_factory=dict
-    )  # lease → use → (by whom, in which epoch)
+    # lease → use → (by whom, in which epoch)
+    uses: dict[str, dict[str, tuple[SimProcess, int | None]]] = field(default_factory=dict)
     stopping: bool = False
     granted: int = 0
     evicted: int = 0
@@ -470,9 +469,8 @@ class Consumer(Program):
     async def _unload(self, holding: Holding) -> None:
         """Called by the library at the safe point, or after a loss."""
         used = self.cast.used_by_others(holding)
-        alone = (
-            holding.lease.given_up and not self.client.connected
-        )  # nobody is there who could refuse
+        # nobody is there who could refuse
+        alone = holding.lease.given_up and not self.client.connected
         if used and holding.lease.state != "gone" and not alone:
             self.world.fail(f"{holding.lease.lease_id} unloads while {used} use it")
         device, key = self.world.devices[holding.gpu], self.process.key
@@ -551,9 +549,8 @@ class Operator(Program):
                 continue
             while continue_with and not await self._do(continue_with, target):
                 await self.pause(1.0)
-        while not await self._do(
-            "resume"
-        ):  # an operator before this one may have died with the GPU drained
+        # an operator before this one may have died with the GPU drained
+        while not await self._do("resume"):
             await self.pause(1.0)
 
     async def _do(self, action: str, target: str = "") -> bool:

@@ -70,9 +70,8 @@ def run_seed(seed: int, lines_max: int | None = TRACE_LINES) -> Report:
     sys.unraisablehook = lambda _: None
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore", RuntimeWarning
-            )  # killed processes leave coroutines behind
+            # killed processes leave coroutines behind
+            warnings.simplefilter("ignore", RuntimeWarning)
             gc.collect()
     finally:
         sys.unraisablehook = hook

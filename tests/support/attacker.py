@@ -42,7 +42,7 @@ def zmtp_frame(payload: bytes, flags: int = 0) -> bytes:
 
 def empties(path: str) -> None:
     """Three million messages of one empty frame."""
-    under_way()
+    say_under_way()
     push(greeted(path), b"\x00\x00" * EMPTY_FRAMES)
 
 
@@ -50,7 +50,7 @@ def maps(path: str) -> None:
     """Messages of 1 MiB and of 16 MiB that hold nothing but empty maps, and as many values as the
     server builds.
     """
-    under_way()
+    say_under_way()
     ends = time.monotonic() + SECONDS_MAX
     allowed = zmtp_frame(b"\x81\xa1x\xdc\x0f\xa0" + b"\x80" * 4000)
     bombs = [
@@ -63,7 +63,7 @@ def maps(path: str) -> None:
 
 def more(path: str) -> None:
     """Frames with MORE set for ever, each of 64 KiB, on one connection after the other."""
-    under_way()
+    say_under_way()
     ends = time.monotonic() + SECONDS_MAX
     while time.monotonic() < ends:
         push(greeted(path), zmtp_frame(bytes(1 << 16), 1) * 64)
@@ -87,7 +87,7 @@ def connects(path: str) -> None:
         if len(peers) == CONNECTIONS_MAX or (peers and len(peers) % 200 == 0):
             if not announced:
                 announced = True
-                under_way()
+                say_under_way()
             cut = set(select_closed(peers))
             peers = [one for one in peers if one not in cut]
         time.sleep(0.001)
@@ -104,7 +104,7 @@ def select_closed(peers: list[socket.socket]) -> list[socket.socket]:
     return closed
 
 
-def under_way() -> None:
+def say_under_way() -> None:
     print("under way", flush=True)
 
 

@@ -34,7 +34,7 @@ class _Process:
         return await asyncio.to_thread(self._forked.wait)
 
 
-async def _start(
+async def _start_fork(
     _python: str, _m: str, module: str, *arguments: str, stdout: IO[bytes], env: Mapping[str, str],
     **_: object,
 ) -> _Process:  # fmt: skip
@@ -43,7 +43,7 @@ async def _start(
 
 
 vars(demo_programs)["asyncio"] = SimpleNamespace(
-    create_subprocess_exec=_start, subprocess=asyncio.subprocess, wait_for=asyncio.wait_for
+    create_subprocess_exec=_start_fork, subprocess=asyncio.subprocess, wait_for=asyncio.wait_for
 )
 
 if __name__ == "__main__":

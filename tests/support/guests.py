@@ -73,7 +73,7 @@ class Server:
 
 
 @contextlib.contextmanager
-def server(
+def sshd_server(
     make_arbiter: Make, folder: Path, users: tuple[str, ...] = (USER,), **options: Any
 ) -> Iterator[Server]:
     """Start both; `options` are those of `Sshd`."""

@@ -95,9 +95,8 @@ class Story:
     allocations: int = 0
     refusals_excused: int = 0
     late_allocations: int = 0
-    waits: list[float] = field(
-        default_factory=list
-    )  # seconds, of everybody who was served or refused
+    # seconds, of everybody who was served or refused
+    waits: list[float] = field(default_factory=list)
 
     def bad(self, rule: str, t: float, text: str) -> None:
         self.findings.append(Finding(rule, t, text))
@@ -217,9 +216,8 @@ def _check_history(
     uses: dict[str, set[str]] = defaultdict(set)  # as far as they began since the daemon did
     epoch = seq = 0
     for event, t in zip(events, times, strict=True):
-        if (
-            event["seq"] > seq + 1
-        ):  # a full disk, and a kill before there was room: nobody knows what ended meanwhile
+        # a full disk, and a kill before there was room: nobody knows what ended meanwhile
+        if event["seq"] > seq + 1:
             loading.clear()
             uses.clear()
         seq = int(event["seq"])
@@ -243,9 +241,8 @@ def _check_history(
                 loading[gpu][lease] = str(event["consumer"])
             case "ready" | "released" | "lost" | "expired" | "denied":
                 loading[gpu].pop(lease, None)
-                claim = claims.get(
-                    lease
-                )  # whoever let go while the arbiter was down ends by time, and rightly
+                # whoever let go while the arbiter was down ends by time, and rightly
+                claim = claims.get(lease)
                 if kind == "expired" and claim is not None and t < claim.until:
                     if _hindered(hindrances, claim.pid, t):
                         continue
@@ -436,9 +433,8 @@ def _check_alone(
         if pid == claim.pid or other.own <= unseen_bytes:
             continue
         theirs = next((c for c in reversed(claims.get(pid, ())) if c.since <= t), None)
-        if (
-            theirs is None or theirs.expired_at < t
-        ):  # a stowaway, or a holder that time took the lease from
+        # a stowaway, or a holder that time took the lease from
+        if theirs is None or theirs.expired_at < t:
             continue
         if claim.exclusive or theirs.exclusive:
             alone = claim if claim.exclusive else theirs

@@ -261,10 +261,8 @@ def beside_what_is_on_its_way(
     for pid in (A, B, IDLE):
         scene.born(pid)
     scene.trace(IDLE, "asked", bytes=GIB, exclusive=False, residue_bytes=int(declared_gib * GIB))
-    verdict = {
-        "lease_id": "L1-1",
-        "consumer": f"p{IDLE}",
-    }  # granted while its process was stopped: it never heard of it
+    # granted while its process was stopped: it never heard of it
+    verdict = {"lease_id": "L1-1", "consumer": f"p{IDLE}"}
     scene.event("verified", **verdict, resolved=False, residue_bytes=9 * GIB)
     scene.event("verified", **verdict, resolved=True, residue_bytes=int(charged_gib * GIB))
     scene.trace(IDLE, "denied", code="lease_lost")

@@ -37,7 +37,7 @@ def _fields(cls: Any) -> list[tuple[str, _Check]]:
 
 
 def _check(hint: Any) -> _Check:
-    """Return whether a value fits a type; of the items of a mapping or a sequence it knows nothing."""
+    """Return whether a value fits a type; items of a mapping or a sequence are not examined."""
     while isinstance(hint, NewType | TypeAliasType):
         hint = hint.__supertype__ if isinstance(hint, NewType) else hint.__value__
     origin, parts = get_origin(hint), get_args(hint)

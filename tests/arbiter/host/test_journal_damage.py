@@ -212,9 +212,8 @@ def test_a_kill_at_any_instant_is_not_taken_for_damage(
                 if record is not None:
                     after[key] = record
             states.append(after)
-        started, *copies = Watched.copies[
-            1:
-        ]  # before and after the start's own write, then four a commit
+        # before and after the start's own write, then four a commit
+        started, *copies = Watched.copies[1:]
         assert opened(started).doubt == ""
         for index, copy in enumerate(copies):
             found = opened(copy)

@@ -58,9 +58,8 @@ def test_a_mutated_request_keeps_its_id_in_the_answer(draw: random.Random, op: s
 @pytest.mark.parametrize("name", BOMBS)
 def test_a_bomb_is_defused_in_little_memory(name: str) -> None:
     frame = BOMBS[name]
-    codec.decode(
-        pack({"op": "ping", "id": 1}), MESSAGE_MAX_BYTES
-    )  # whatever is made once is made now
+    # whatever is made once is made now
+    codec.decode(pack({"op": "ping", "id": 1}), MESSAGE_MAX_BYTES)
     tracemalloc.start()
     try:
         found = code_of(frame)

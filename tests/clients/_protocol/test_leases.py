@@ -19,9 +19,8 @@ def test_renewal_every_third_of_the_shortest_ttl(link: Wire) -> None:
     asked_at = link.now
     link.now += 1.0
     link.reply(renew, alive=["L1-1"], gone=[])
-    assert (
-        record.confirmed_at == asked_at
-    )  # the arbiter counts from the message it heard, not from our hearing of it
+    # the arbiter counts from the message it heard, not from our hearing of it
+    assert record.confirmed_at == asked_at
 
 
 def test_a_renewal_tells_that_a_lease_is_gone(link: Wire) -> None:

@@ -45,9 +45,8 @@ def test_the_present_span_goes_along_unless_another_one_is_named() -> None:
         assert traces.environ() == {"TRACEPARENT": PARENT}, "for a program that is started here"
         assert traces.along({"op": "x"}) == {"op": "x", "traceparent": PARENT}
         assert traces.along({"traceparent": OTHER}) == {"traceparent": OTHER}
-        with traces.joined(
-            OTHER
-        ):  # the arbiter asks the holder to leave while the program does something else
+        # the arbiter asks the holder to leave while the program does something else
+        with traces.joined(OTHER):
             assert traces.present() == OTHER
         with traces.joined(None):
             assert traces.present() is None

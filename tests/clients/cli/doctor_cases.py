@@ -96,7 +96,7 @@ def status(**fields: Any) -> Callable[[Machine], Machine]:
     return lambda m: replace(m, arbiter=replace(m.arbiter, status=replace(STATUS, **fields)))
 
 
-def gpu(**fields: Any) -> Callable[[Machine], Machine]:
+def gpu_with(**fields: Any) -> Callable[[Machine], Machine]:
     return status(gpus=(replace(GPU, **fields),))
 
 
@@ -227,18 +227,18 @@ CASES = [
     Case("daemon.files", "df -h", change=status(problems=("the journal cannot be written",))),
     Case("daemon.drained", "vramctl resume", change=status(drained="op: driver")),
     Case("probe.none", "nvidia-smi", change=status(gpus=())),
-    Case("probe.unreadable", "nvidia-smi", change=gpu(measured_used_bytes=None)),
-    Case("probe.pressure", "--kind pressure", change=gpu(pressure_bytes=GIB)),
+    Case("probe.unreadable", "nvidia-smi", change=gpu_with(measured_used_bytes=None)),
+    Case("probe.pressure", "--kind pressure", change=gpu_with(pressure_bytes=GIB)),
     Case(
         "probe.blocked",
         "vramctl status",
-        change=gpu(blocked=BlockView(Block.LOADING, text="x loads")),
+        change=gpu_with(blocked=BlockView(Block.LOADING, text="x loads")),
     ),
     Case(
         "stowaways.process",
         "kill 77; vramctl run --vram 1GiB -- python train.py",
         {"/proc/77/cmdline": "python\0train.py\0"},
-        gpu(processes=(STOWAWAY,)),
+        gpu_with(processes=(STOWAWAY,)),
     ),
     Case("oom.score", f"tee /proc/{PID}/oom_score_adj", {f"/proc/{PID}/oom_score_adj": "0\n"}),
     Case(

@@ -162,9 +162,8 @@ def test_following_shows_the_past_and_then_the_present(
             "history", "--since", "1h", "-c", "early", "--json", environ=arbiter_daemon.environ
         )
         kinds = [event["kind"] for event in json.loads(shown.stdout)["events"]]
-        kinds = [
-            kind for kind in kinds if kind != "queued"
-        ]  # where the first reading was still under way
+        # where the first reading was still under way
+        kinds = [kind for kind in kinds if kind != "queued"]
         assert kinds == ["granted", "ready", "switch"]
         assert vramctl("history", "--since", "soon", environ=arbiter_daemon.environ).returncode == 2
 

@@ -92,11 +92,7 @@ def test_the_cgroup_of_a_unit_that_does_not_run_is_known_by_its_slice(
             {"CgroupManager": "systemd", "CgroupParent": "gpu-big.slice"},
             f"/gpu.slice/gpu-big.slice/libpod-{IDENTITY}.scope",
         ),
-        (
-            "docker",
-            {"CgroupManager": "systemd"},
-            f"/system.slice/docker-{IDENTITY}.scope",
-        ),
+        ("docker", {"CgroupManager": "systemd"}, f"/system.slice/docker-{IDENTITY}.scope"),
     ],
 )
 def test_the_cgroup_of_a_container_that_does_not_run_is_known_by_its_engine(

@@ -198,9 +198,8 @@ def test_a_user_has_a_share_of_waiting_requests_in_number_and_in_bytes(tmp_path:
             refusal = await client.answer()
             assert refusal["code"] == "limit_exceeded"
             assert "bytes of requests" in refusal["message"]
-            assert (await client.ask({"op": "ping", "id": 99}))[
-                "re"
-            ] == 99  # what is small is answered
+            # what is small is answered
+            assert (await client.ask({"op": "ping", "id": 99}))["re"] == 99
             server.go_on.set()
             assert {(await client.answer())["re"] for _ in range(8)} == set(range(8))
             server.go_on.clear()

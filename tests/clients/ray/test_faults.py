@@ -42,20 +42,20 @@ Start = Callable[[int], list[Any]]
 
 
 @pytest.fixture
-def start(boxes: Boxes, notes: Path) -> Iterator[Start]:
+def start_actors(boxes: Boxes, notes: Path) -> Iterator[Start]:
     """`start(per_node)`: actors of each box, in the boxes' order; they move if theirs is gone."""
     import ray
 
     made = []
     with Fleet() as fleet:
 
-        def start(per_node: int) -> list[Any]:
+        def start_actors(per_node: int) -> list[Any]:
             for box in boxes.nodes:
                 where = {"per_node": per_node, "nodes": [box.node_id]}
                 made.extend(fleet.spread(Player, str(notes), EPISODE_S, **where))
             return made
 
-        yield start
+        yield start_actors
     for actor in made:
         ray.kill(actor)
 
@@ -68,7 +68,7 @@ def pid_of(actor: Any) -> int:
     return pid
 
 
-def play(
+def play_seeds(
     actors: list[Any], out: Path, at: dict[int, Callable[[], object]], deadline_s: float = 60.0
 ) -> list[Result]:
     """Play all seeds; `at` says what happens when so many have results."""
@@ -100,11 +100,11 @@ def check_gpus(boxes: Boxes, notes: Path) -> None:
 
 
 def test_each_seed_once_and_models_take_turns_between_calls(
-    boxes: Boxes, start: Start, notes: Path, tmp_path: Path
+    boxes: Boxes, start_actors: Start, notes: Path, tmp_path: Path
 ) -> None:
-    actors = start(2)
+    actors = start_actors(2)
     out = tmp_path / "out"
-    results = play(actors, out, {})
+    results = play_seeds(actors, out, {})
     check_each_once(results, out)
     assert set(Counter(one["seed"] for one in noted(notes, "ended")).values()) == {1}
     assert {result.node for result in results} == {box.node_id for box in boxes.nodes}
@@ -113,26 +113,28 @@ def test_each_seed_once_and_models_take_turns_between_calls(
 
 
 def test_a_daemon_is_restarted_under_actors(
-    boxes: Boxes, start: Start, notes: Path, tmp_path: Path
+    boxes: Boxes, start_actors: Start, notes: Path, tmp_path: Path
 ) -> None:
     def restart() -> None:
         boxes.nodes[1].daemon.kill()
         boxes.nodes[1].daemon.start()
 
     out = tmp_path / "out"
-    actors = start(1)
-    check_each_once(play(actors, out, {12: restart}), out)
+    actors = start_actors(1)
+    check_each_once(play_seeds(actors, out, {12: restart}), out)
     assert set(Counter(one["seed"] for one in noted(notes, "begun")).values()) == {1}
     check_gpus(boxes, notes)
 
 
-def test_a_process_stands_still(boxes: Boxes, start: Start, notes: Path, tmp_path: Path) -> None:
+def test_a_process_stands_still(
+    boxes: Boxes, start_actors: Start, notes: Path, tmp_path: Path
+) -> None:
     """Ray gives no error of it: its deadline ends it."""
-    actors = start(1)
+    actors = start_actors(1)
     pid, out = pid_of(actors[1]), tmp_path / "out"
     with ThreadPoolExecutor(1) as pool:
         frozen = pool.submit(until, lambda: frozen_inside(notes, pid))
-        check_each_once(play(actors, out, {}, deadline_s=5.0), out)
+        check_each_once(play_seeds(actors, out, {}, deadline_s=5.0), out)
         assert frozen.result()
     until(lambda: not alive(pid))
     check_gpus(boxes, notes)
@@ -191,7 +193,7 @@ def test_seeds_without_a_result_are_named(boxes: Boxes, tmp_path: Path) -> None:
 
 
 def test_a_node_and_its_arbiter_are_killed(
-    boxes: Boxes, start: Start, notes: Path, tmp_path: Path
+    boxes: Boxes, start_actors: Start, notes: Path, tmp_path: Path
 ) -> None:
     killed_at: list[float] = []
 
@@ -200,7 +202,7 @@ def test_a_node_and_its_arbiter_are_killed(
         boxes.kill("n1")
 
     out = tmp_path / "out"
-    actors = start(1)
-    check_each_once(play(actors, out, {12: kill}), out)
+    actors = start_actors(1)
+    check_each_once(play_seeds(actors, out, {12: kill}), out)
     assert time.monotonic() - killed_at[0] < 120.0  # `make bench-fleet` measures it
     check_gpus(boxes, notes)

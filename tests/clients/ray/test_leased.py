@@ -71,17 +71,17 @@ Make = Callable[..., Any]
 
 
 @pytest.fixture
-def make(arbiter_daemon: ArbiterProcess, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
+def make_policy(arbiter_daemon: ArbiterProcess, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     """`make(wait_s=…)`: an object of a leased class of 5 GiB of 8."""
     monkeypatch.setenv("VRAM_ARBITER_ENDPOINT", arbiter_daemon.endpoint)
 
-    def make(**options: Any) -> Any:
+    def make_policy(**options: Any) -> Any:
         class Policy(Model):
             folder = arbiter_daemon.gpu_folder
 
         return leased(vram="5GiB", model="pi0", **options)(Policy)()
 
-    yield make
+    yield make_policy
     gc.collect()
     report = check_log((arbiter_daemon.gpu_folder / "log.jsonl").read_text())
     assert (report.problems, report.oom_events, report.peak_bytes) == ([], 0, 5 * GIB)
@@ -89,9 +89,9 @@ def make(arbiter_daemon: ArbiterProcess, monkeypatch: pytest.MonkeyPatch) -> Ite
 
 @pytest.mark.e2e
 def test_the_first_call_loads_and_calls_that_follow_share_uses(
-    make: Make, arbiter_daemon: ArbiterProcess
+    make_policy: Make, arbiter_daemon: ArbiterProcess
 ) -> None:
-    model = make()
+    model = make_policy()
     assert model.loads == 0
     assert [model.act(x) for x in range(200)] == list(range(200))
     assert (model.loads, model.warmed) == (1, 1)
@@ -101,8 +101,10 @@ def test_the_first_call_loads_and_calls_that_follow_share_uses(
 
 
 @pytest.mark.e2e
-def test_evicted_between_calls_and_never_inside(make: Make, client: Client, spec: Spec) -> None:
-    model = make()
+def test_evicted_between_calls_and_never_inside(
+    make_policy: Make, client: Client, spec: Spec
+) -> None:
+    model = make_policy()
     with ThreadPoolExecutor(2) as pool:
         inside = pool.submit(model.wait)
         assert model.begun.wait(PATIENCE_S)
@@ -121,9 +123,11 @@ def test_evicted_between_calls_and_never_inside(make: Make, client: Client, spec
 
 
 @pytest.mark.e2e
-def test_a_revoke_that_is_withdrawn_keeps_the_model(make: Make, client: Client, spec: Spec) -> None:
+def test_a_revoke_that_is_withdrawn_keeps_the_model(
+    make_policy: Make, client: Client, spec: Spec
+) -> None:
     """A call that waited for the end of the lease never began."""
-    model = make()
+    model = make_policy()
     with ThreadPoolExecutor(3) as pool:
         inside = pool.submit(model.wait)
         assert model.begun.wait(PATIENCE_S)
@@ -139,17 +143,17 @@ def test_a_revoke_that_is_withdrawn_keeps_the_model(make: Make, client: Client, 
 
 
 @pytest.mark.e2e
-def test_a_body_is_never_run_again(make: Make) -> None:
+def test_a_body_is_never_run_again(make_policy: Make) -> None:
     """A refusal of another lease inside the body is the caller's."""
-    model = make()
+    model = make_policy()
     with pytest.raises(LeaseRevoking, match="of another lease"):
         model.refused_inside()
     assert model.loads == 11
 
 
 @pytest.mark.e2e
-def test_a_load_that_fails_gives_the_lease_up(make: Make, client: Client) -> None:
-    model = make()
+def test_a_load_that_fails_gives_the_lease_up(make_policy: Make, client: Client) -> None:
+    model = make_policy()
     model.fails = True
     with pytest.raises(RuntimeError, match="no weights"):
         model.act(1)
@@ -160,10 +164,10 @@ def test_a_load_that_fails_gives_the_lease_up(make: Make, client: Client) -> Non
 
 @pytest.mark.e2e
 def test_a_wait_that_ends_is_refused_to_all_that_waited(
-    make: Make, client: Client, spec: Spec, arbiter_daemon: ArbiterProcess
+    make_policy: Make, client: Client, spec: Spec, arbiter_daemon: ArbiterProcess
 ) -> None:
     """Each waited for a time limit of its own, one after the other."""
-    model = make(wait_s=1.0)
+    model = make_policy(wait_s=1.0)
     with client.lease(spec("other", 5, evictable=False)) as pinned, ThreadPoolExecutor(4) as pool:
         pinned.ready()
         waiting = [pool.submit(model.act, 1) for _ in range(4)]
@@ -176,8 +180,8 @@ def test_a_wait_that_ends_is_refused_to_all_that_waited(
 
 
 @pytest.mark.e2e
-def test_the_end_of_the_object_gives_the_lease_back(make: Make, client: Client) -> None:
-    model = make()
+def test_the_end_of_the_object_gives_the_lease_back(make_policy: Make, client: Client) -> None:
+    model = make_policy()
     model.act(1)
     del model
     gc.collect()
@@ -186,10 +190,10 @@ def test_the_end_of_the_object_gives_the_lease_back(make: Make, client: Client) 
 
 @pytest.mark.e2e
 def test_coroutines_and_one_that_is_canceled_while_it_waits(
-    make: Make, client: Client, spec: Spec
+    make_policy: Make, client: Client, spec: Spec
 ) -> None:
     """A use that began for a caller that was gone was never ended."""
-    model = make()
+    model = make_policy()
 
     async def story() -> None:
         assert await asyncio.gather(*(model.later(x) for x in range(20))) == list(range(20))
@@ -227,11 +231,11 @@ def test_a_coroutine_uses_what_is_loaded_without_a_thread(
 @pytest.mark.heavy
 @pytest.mark.e2e
 def test_a_task_runs_inside_a_lease_of_its_own(
-    make: Make, arbiter_daemon: ArbiterProcess, client: Client
+    make_policy: Make, arbiter_daemon: ArbiterProcess, client: Client
 ) -> None:
     """Ray runs the function; `make` says where the arbiter is."""
     ray: Any = pytest.importorskip("ray")
-    make().act(1)  # its 5 of 8 GiB leave for the task
+    make_policy().act(1)  # its 5 of 8 GiB leave for the task
 
     def job(x: int) -> int:
         return x + int(client.status().leases[-1].consumer.startswith("job-"))

@@ -84,11 +84,7 @@ def test_it_says_what_the_robot_may_and_what_to_run(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [
-        ["--name", "Arm 1"],
-        ["--name", "a", "--sidecar", 'x"y'],
-        ["--name", "a", "--door", "0"],
-    ],
+    [["--name", "Arm 1"], ["--name", "a", "--sidecar", 'x"y'], ["--name", "a", "--door", "0"]],
 )
 def test_what_would_change_the_line_is_refused(wrong: list[str]) -> None:
     told = vramctl("remote", "authorize", "k.pub", *wrong, environ=os.environ)

@@ -174,10 +174,7 @@ async def test_a_playbook_and_a_reward_model_reach_the_language_model(
 
 @pytest.mark.e2e
 async def test_a_planner_whose_model_takes_turns_on_the_gpu_ends_its_task(
-    tmp_path: Path,
-    a_runner: Any,
-    arbiter_daemon: ArbiterProcess,
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, a_runner: Any, arbiter_daemon: ArbiterProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Behind the gateway the model leaves for another server while a goal runs, and comes back for
     the next decision."""

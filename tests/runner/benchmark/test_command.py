@@ -249,10 +249,7 @@ def test_a_killed_worker_costs_no_seed(
 
 @pytest.mark.heavy
 def test_a_seed_that_kills_its_workers_is_an_error_and_alone_is_played_again(
-    tmp_path: Path,
-    notes: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What a lack of memory does to one seed: it is never left out silently."""
     monkeypatch.setenv("FATES", json.dumps({1: (signal.SIGKILL, 3)}))

@@ -49,7 +49,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def start(tmp_path: Path, video: Path) -> Iterator[Start]:
+def deploy(tmp_path: Path, video: Path) -> Iterator[Start]:
     started: list[prepared.Forked] = []
 
     def begin(
@@ -95,7 +95,7 @@ async def client_of(tmp_path: Path) -> AsyncIterator[RunnerClient]:
         yield client
 
 
-async def under_way(client: RunnerClient, ticks: int = 5) -> Any:
+async def goal_under_way(client: RunnerClient, ticks: int = 5) -> Any:
     """A goal that has moved the arm for so many ticks."""
     goal = await client.send_goal(RSKILL, prompt="nod")
     async for feedback in goal.feedback():
@@ -125,15 +125,15 @@ async def stopped(client: RunnerClient, reason: str) -> None:
                 raise
 
 
-async def test_a_signal_cancels_the_goal_and_ends_in_order(start: Start, tmp_path: Path) -> None:
+async def test_a_signal_cancels_the_goal_and_ends_in_order(deploy: Start, tmp_path: Path) -> None:
     """SIGINT is that of test_program.py."""
-    process = start()
+    process = deploy()
 
     async with client_of(tmp_path) as client:
         assert (await client.call(PingRunner()))["robot"] == "bench"
         picture = await client.frame(max_age_ms=5000, encoding="png")
         assert (picture["camera"], picture["width"], picture["height"]) == ("front", WIDTH, HEIGHT)
-        goal = await under_way(client)
+        goal = await goal_under_way(client)
         assert set((await client.state())["world"]["diagnostics"]) == {"front", "joint_state"}
         await all_fresh(client)
         process.send_signal(signal.SIGTERM)
@@ -159,9 +159,9 @@ async def test_a_signal_cancels_the_goal_and_ends_in_order(start: Start, tmp_pat
     ids=["done", "limited task", "limited run with a task", "limited run"],
 )
 def test_the_end_of_a_files_task_or_ticks_ends_the_program(
-    start: Start, more: str, steps: str, code: int, success: bool | None, said: str
+    deploy: Start, more: str, steps: str, code: int, success: bool | None, said: str
 ) -> None:
-    process = start(more=more, steps=steps)
+    process = deploy(more=more, steps=steps)
     out, err = process.communicate(timeout=120)
     assert process.returncode == code, err
     result = json.loads(out)
@@ -172,9 +172,9 @@ def test_the_end_of_a_files_task_or_ticks_ends_the_program(
 
 
 async def test_a_camera_file_that_ends_withholds_and_fails_the_goal(
-    start: Start, tmp_path: Path
+    deploy: Start, tmp_path: Path
 ) -> None:
-    start(loop=False, fps=10)  # three seconds: long enough for the runner to have seen it
+    deploy(loop=False, fps=10)  # three seconds: long enough for the runner to have seen it
 
     async with client_of(tmp_path) as client:
         goal = await client.send_goal(RSKILL, prompt="nod")
@@ -184,17 +184,16 @@ async def test_a_camera_file_that_ends_withholds_and_fails_the_goal(
         assert (await client.state())["world"]["diagnostics"]["front"] == "error"
 
 
-async def test_the_emergency_stop_of_a_real_process(start: Start, tmp_path: Path) -> None:
-    process = start()
+async def test_the_emergency_stop_of_a_real_process(deploy: Start, tmp_path: Path) -> None:
+    process = deploy()
 
     async with client_of(tmp_path) as client:
-        goal = await under_way(client)
+        goal = await goal_under_way(client)
         words = ("estop", "--reason", "test", "--endpoint", client.endpoint)
         argv = [sys.executable, "-m", "vram_arbiter.runner", *words]
         said, complaint = b"", b"has not obeyed"
-        while (
-            b"has not obeyed" in complaint
-        ):  # within a second, which a busy machine may need for less
+        # within a second, which a busy machine may need for less
+        while b"has not obeyed" in complaint:
             program = await asyncio.create_subprocess_exec(
                 *argv, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
             )
@@ -212,9 +211,9 @@ async def test_the_emergency_stop_of_a_real_process(start: Start, tmp_path: Path
 
 
 async def test_after_an_emergency_stop_a_task_is_not_restarted_and_the_robot_stays_connected(
-    start: Start, tmp_path: Path
+    deploy: Start, tmp_path: Path
 ) -> None:
-    process = start(more=TASK)
+    process = deploy(more=TASK)
 
     async with client_of(tmp_path) as client:
         await client.ping(timeout_s=60)
@@ -235,11 +234,11 @@ async def test_after_an_emergency_stop_a_task_is_not_restarted_and_the_robot_sta
 
 
 async def test_a_stopped_robot_does_not_move_again_because_its_runner_was_killed_and_restarted(
-    start: Start, tmp_path: Path
+    deploy: Start, tmp_path: Path
 ) -> None:
     """Regression: the latch was kept in memory only, and systemd restarts a killed runner."""
     mark = tmp_path / "robot-bench.estop"
-    first = start()
+    first = deploy()
 
     async with client_of(tmp_path) as client:
         await stopped(client, "a hand is in the way")
@@ -247,13 +246,13 @@ async def test_a_stopped_robot_does_not_move_again_because_its_runner_was_killed
     assert "a hand is in the way" in mark.read_text()
     first.kill()  # as the kernel does when memory is short; systemd starts it again
     first.communicate(timeout=60)
-    second = start()
+    second = deploy()
     _, err = second.communicate(timeout=60)
     assert second.returncode == 2, err  # systemd's RestartPreventExitStatus
     assert "a hand is in the way" in err
     assert f"delete {mark}" in err
     mark.unlink()
-    third = start()
+    third = deploy()
 
     async with client_of(tmp_path) as client:
         await stopped(client, "again")
@@ -285,18 +284,20 @@ async def test_a_port_has_one_runner_whatever_its_robots_are_called(
         claim(robot("other", tmp_path / "ttyACM1"), stack)
 
 
-async def test_a_robot_has_one_runner(start: Start, tmp_path: Path) -> None:
-    first = start()
+async def test_a_robot_has_one_runner(deploy: Start, tmp_path: Path) -> None:
+    first = deploy()
 
     async with client_of(tmp_path) as client:
         await client.ping(timeout_s=60)
-        second = start("--endpoint", f"ipc://{tmp_path}/second.sock")
+        second = deploy("--endpoint", f"ipc://{tmp_path}/second.sock")
         _, err = await asyncio.to_thread(second.communicate, timeout=60)
         assert second.returncode == 1
         assert f"(pid {first.pid}) already uses robot bench" in err
 
 
-def test_a_signal_while_it_waits_for_a_camera_ends_it_at_once(start: Start, tmp_path: Path) -> None:
+def test_a_signal_while_it_waits_for_a_camera_ends_it_at_once(
+    deploy: Start, tmp_path: Path
+) -> None:
     import socket
 
     with socket.create_server(("127.0.0.1", 0)) as listening:  # accepts, and never says a word
@@ -305,7 +306,7 @@ def test_a_signal_while_it_waits_for_a_camera_ends_it_at_once(start: Start, tmp_
             f"  - {{sensor_id: silent, backend_params: {{url: 'rtsp://127.0.0.1:{port}/', "
             "timeout_s: 60}}\n"
         )
-        process = start(more=more)
+        process = deploy(more=more)
         listening.settimeout(60)
         connection, _ = listening.accept()  # it waits for a picture now
         with connection:

@@ -68,7 +68,7 @@ def programs(arbiter_daemon: ArbiterProcess) -> Iterator[GrabPrograms]:
     started.close()
 
 
-def uses(status: StatusReply) -> list[int]:
+def uses_of_grab(status: StatusReply) -> list[int]:
     return [lease.uses for lease in status.leases if lease.consumer == "grab"]
 
 
@@ -83,7 +83,7 @@ async def interrupted_grab(arbiter: ArbiterProcess, programs: GrabPrograms) -> N
         async for feedback in goal.feedback():
             if feedback["state"] == "running":
                 break
-        assert [count >= 1 for count in uses(await watcher.status())] == [True]
+        assert [count >= 1 for count in uses_of_grab(await watcher.status())] == [True]
         lift = begun["world"]["joint_state"]["name"].index("shoulder_lift")
         here = begun["world"]["joint_state"]["position"][lift]
         while abs((await runner.state())["world"]["joint_state"]["position"][lift] - here) < 0.5:
@@ -92,7 +92,7 @@ async def interrupted_grab(arbiter: ArbiterProcess, programs: GrabPrograms) -> N
         assert (await goal.result(60))["status"] == "canceled"
         assert await asyncio.to_thread(programs.runner.wait, 60) == 0
         async with asyncio.timeout(60):
-            while any(uses(await watcher.status())):
+            while any(uses_of_grab(await watcher.status())):
                 await watcher.ping(timeout_s=60)
 
 

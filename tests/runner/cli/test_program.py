@@ -65,10 +65,8 @@ def test_a_signal_ends_it_in_order_and_the_video_is_whole(
             truth = await client.ground_truth()
             assert truth["target"] in truth["objects"]
             assert truth["held"] is None
-            far = {
-                "header": {"frame_id": "map"},
-                "pose": {"position": {"x": -50.0, "y": 0.0}},
-            }  # it never gets there
+            # it never gets there
+            far = {"header": {"frame_id": "map"}, "pose": {"position": {"x": -50.0, "y": 0.0}}}
             goal = await client.send_goal("vram-arbiter/so101-navigate", goal_params={"pose": far})
             async for feedback in goal.feedback():
                 if feedback["tick_idx"] > 5:

@@ -106,7 +106,7 @@ def begin(runner: HardwareRunner, skill: Nod, **goal: Any) -> list[SkillEnded]:
     return ended
 
 
-def test_a_skill_sees_the_cameras_and_its_actions_reach_the_motors(
+def test_a_skill_sees_cameras_and_moves_the_motors(
     started: MakeRunner, twin: Twin, front: FedCamera, nod: Any, clock: Any
 ) -> None:
     seen: list[WorldState] = []
@@ -328,9 +328,8 @@ def test_the_emergency_stop_comes_before_anything_else(
     runner = started(on_estop=told.append)
     skill = nod(on_step=lambda world: runner.request_estop("a hand is in the way"))
     ended = begin(runner, skill)
-    assert not tick(
-        runner, clock
-    ).action_applied  # the step that was under way is not sent any more
+    # the step that was under way is not sent any more
+    assert not tick(runner, clock).action_applied
     assert not twin.sent
     assert twin.story == ["connect", "halt"]
     assert told == ["a hand is in the way"]

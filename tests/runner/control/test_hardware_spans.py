@@ -31,7 +31,7 @@ def outcome() -> Any:
     return json.loads(done.stdout)
 
 
-def test_each_stage_of_a_tick_is_a_span_of_the_goals_trace(outcome: Any) -> None:
+def test_each_stage_of_a_tick_is_a_span(outcome: Any) -> None:
     spans = outcome["spans"]
     assert {span["trace_id"] for span in spans} == {TRACE}
     first, *later = [span for span in spans if span["name"] == telemetry.SPAN_TICK]
@@ -55,7 +55,7 @@ def test_each_stage_of_a_tick_is_a_span_of_the_goals_trace(outcome: Any) -> None
     check_dashboard(*(promql.scrape(page) for page in outcome["pages"]))
 
 
-def test_what_cannot_be_trusted_is_an_event_of_the_first_tick(outcome: Any) -> None:
+def test_untrusted_data_is_an_event_of_the_first_tick(outcome: Any) -> None:
     """By the world state, whether a skill needs it or not; each failed reading is one of its own.
     What is too old is told from what failed."""
     ended = [
@@ -172,7 +172,7 @@ def check_metrics(metrics: dict[str, Any]) -> None:
     assert {metrics[name]["unit"] for name in durations} == {"s"}
 
 
-def test_a_share_of_a_goals_ticks_is_traced_from_its_first_tick_on(outcome: Any) -> None:
+def test_a_share_of_a_goals_ticks_is_traced(outcome: Any) -> None:
     """The first action is always in the trace, then one tick in four; what is left out names the
     goal. Without a goal nothing is traced.
     """

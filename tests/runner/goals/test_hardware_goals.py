@@ -275,9 +275,8 @@ async def test_whoever_names_no_endpoint_stops_the_system_service_too(
     assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
     assert made.twin.story == ["connect", "halt"]
     (tmp_path / "of-this-login").mkdir()
-    (
-        tmp_path / "of-this-login" / "runner.sock"
-    ).touch()  # nobody answers there: was that the robot that moves?
+    # nobody answers there: was that the robot that moves?
+    (tmp_path / "of-this-login" / "runner.sock").touch()
     assert await asyncio.to_thread(main, ["estop"]) == 1
     said = capfd.readouterr()
     assert said.out.count("bench: emergency stop: smoke") == 2

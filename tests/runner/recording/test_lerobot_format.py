@@ -69,17 +69,17 @@ def arm_tick(index: int) -> GoalTick:
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("lerobot") / "set"
-    root.mkdir()
+def recorded_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    recorded_set = tmp_path_factory.mktemp("lerobot") / "set"
+    recorded_set.mkdir()
     assert UNITS is not None
-    files = LerobotFiles(root, fps=30, robot=UNITS.robot_type, lerobot=True)
+    files = LerobotFiles(recorded_set, fps=30, robot=UNITS.robot_type, lerobot=True)
     rows = [row_of(arm_tick(index), ("front",), UNITS) for index in range(FRAMES)]
     features = files.begin(features_of(rows[0]))
     for row in rows:
         files.add(frame_of(row, features))
     files.finish({"goal_id": goal().goal_id, "units": LEROBOT_UNITS, "status": "succeeded"})
-    return root
+    return recorded_set
 
 
 def offline(monkeypatch: pytest.MonkeyPatch, cache: Path) -> None:
@@ -90,7 +90,7 @@ def offline(monkeypatch: pytest.MonkeyPatch, cache: Path) -> None:
 
 
 def test_lerobot_replay_drives_a_robot_with_the_recorded_actions(
-    root: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    recorded_set: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     offline(monkeypatch, tmp_path)
     from lerobot.robots import Robot, RobotConfig
@@ -126,7 +126,7 @@ def test_lerobot_replay_drives_a_robot_with_the_recorded_actions(
             return action
 
     monkeypatch.setattr(lerobot_replay, "make_robot_from_config", Arm)
-    dataset = lerobot_replay.DatasetReplayConfig("local/recording", episode=0, root=root)
+    dataset = lerobot_replay.DatasetReplayConfig("local/recording", episode=0, root=recorded_set)
     lerobot_replay.replay(
         lerobot_replay.ReplayConfig(
             robot=Config(calibration_dir=tmp_path), dataset=dataset, play_sounds=False
@@ -142,7 +142,7 @@ def test_lerobot_replay_drives_a_robot_with_the_recorded_actions(
 
 
 def test_it_merges_with_what_lerobot_recorded(
-    root: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    recorded_set: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """The other dataset is written as `lerobot-record` does: columns from the driver's features."""
     offline(monkeypatch, tmp_path / "cache")
@@ -173,7 +173,7 @@ def test_it_merges_with_what_lerobot_recorded(
     theirs.finalize()
     aggregate_datasets(
         repo_ids=["local/recording", "local/theirs"],
-        roots=[root, tmp_path / "theirs"],
+        roots=[recorded_set, tmp_path / "theirs"],
         aggr_repo_id="local/both",
         aggr_root=tmp_path / "both",
     )
@@ -182,6 +182,6 @@ def test_it_merges_with_what_lerobot_recorded(
     assert float(both[1]["observation.state"][0]) == pytest.approx(math.degrees(0.1), abs=1e-3)
 
 
-def test_it_has_no_ticks_to_replay(root: Path) -> None:
+def test_it_has_no_ticks_to_replay(recorded_set: Path) -> None:
     with pytest.raises(ConfigError, match="the columns of lerobot only"):
-        read_frame(root, 2)
+        read_frame(recorded_set, 2)

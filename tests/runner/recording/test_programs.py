@@ -73,10 +73,8 @@ def test_the_episode_of_a_killed_simulator_is_finished_by_its_writer(
             asyncio.timeout(WAIT_S),
             RunnerClient(f"ipc://{tmp_path}/runner.sock", connect_timeout_s=WAIT_S) as client,
         ):
-            far = {
-                "header": {"frame_id": "map"},
-                "pose": {"position": {"x": -50.0, "y": 0.0}},
-            }  # it is killed on its way
+            # it is killed on its way
+            far = {"header": {"frame_id": "map"}, "pose": {"position": {"x": -50.0, "y": 0.0}}}
             goal = await client.send_goal(
                 RSKILL, goal_params={"pose": far}, traceparent=f"00-{TRACE}-{SPAN}-01"
             )
@@ -139,10 +137,8 @@ def test_a_deployment_records_into_its_save_dir(start_recording: Start, tmp_path
     assert note["frames"] >= 12
     first, second = read_frame(root, 0), read_frame(root, 1)
     assert first.tick["action_applied"]
-    assert (
-        second.tick["index"] > first.tick["index"]
-    )  # next to each other, unless the machine stood still
+    # next to each other, unless the machine stood still
+    assert second.tick["index"] > first.tick["index"]
     assert first.action["wrist_flex"] == pytest.approx(first.state["wrist_flex"] + 0.01, abs=1e-4)
-    assert (
-        read_frame(root, note["frames"] - 1).tick["success"] is None
-    )  # the skill's word is in the note
+    # the skill's word is in the note
+    assert read_frame(root, note["frames"] - 1).tick["success"] is None

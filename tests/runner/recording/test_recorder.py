@@ -165,9 +165,8 @@ def test_lerobots_own_reader_finds_every_tick(
         assert float(row["timestamp"]) == pytest.approx(index / 30)
         seen = row["observation.images.front"]
         assert tuple(seen.shape) == (3, HEIGHT, WIDTH)
-        assert float(seen.mean()) * 255 == pytest.approx(
-            10 * index, abs=3
-        )  # the picture of this very tick
+        # the picture of this very tick
+        assert float(seen.mean()) * 255 == pytest.approx(10 * index, abs=3)
     assert [index for index, row in enumerate(rows) if row["next.done"]] == [5, 9, 12, 14]
     assert "next.success" not in dataset.meta.features, "no world judged"
 
@@ -229,9 +228,8 @@ def test_a_killed_writer_ends_the_recording_after_the_goal_that_runs(
 def test_a_disk_that_takes_nothing_costs_the_goal_and_no_more(recorded: Recorded) -> None:
     assert isinstance(recorded.blocked, InternalError)
     assert "file-002.parquet" in recorded.blocked.message
-    assert (
-        read_frame(recorded.root, 10).goal["goal_id"] == "g3"
-    )  # its files have the name that was taken
+    # its files have the name that was taken
+    assert read_frame(recorded.root, 10).goal["goal_id"] == "g3"
 
 
 def test_other_columns_are_said_before_a_goal_and_cost_only_it(recorded: Recorded) -> None:

@@ -163,11 +163,8 @@ def test_units_come_back_as_they_went(unit: JointUnit, sign: int, angle_rad: flo
         (scale_of_unit(JointUnit.PERCENT, -0.5, 1.5, -1), 100.0, -0.5),
         (scale_of_unit(JointUnit.SIGNED_PERCENT, -1.0, 3.0), 0.0, 1.0),
         (scale_of_unit(JointUnit.SIGNED_PERCENT, -1.0, 3.0), 100.0, 3.0),
-        (
-            scale_of_unit(JointUnit.PERCENT, 0.0, 1.0),
-            110.0,
-            1.1,
-        ),  # beyond its range is told, not hidden
+        # beyond its range is told, not hidden
+        (scale_of_unit(JointUnit.PERCENT, 0.0, 1.0), 110.0, 1.1),
     ],
 )
 def test_units_mean_what_they_say(scale: Scale, value: float, angle_rad: float) -> None:

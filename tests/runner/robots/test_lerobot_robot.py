@@ -60,10 +60,8 @@ def test_it_reads_in_rad_what_lerobot_says_in_its_units(make_robot: Make, clock:
     state = hal.read_state()
     assert state.name == hal.description.joint_names == ("motor_1", "motor_2", "motor_3")
     assert state.position == pytest.approx((math.pi / 2, -0.5, -0.5))
-    assert (state.velocity, state.effort) == (
-        (),
-        (),
-    )  # lerobot does not say them: nothing is made up
+    # lerobot does not say them: nothing is made up
+    assert (state.velocity, state.effort) == ((), ())
     assert state.stamp_ns == clock.now_ns()
 
 
@@ -261,9 +259,8 @@ def test_an_emergency_stop_holds_or_lets_go_as_the_file_says(
         hal.estop("test")
     assert robot_of(hal).bus.torque is torque
     if torque:
-        assert robot_of(hal).sent[-1]["motor_1"] == pytest.approx(
-            40.0
-        )  # here, not where it was going
+        # here, not where it was going
+        assert robot_of(hal).sent[-1]["motor_1"] == pytest.approx(40.0)
     with pytest.raises(EstopRequested):
         hal.send_action(moving(motor_1=0.0))
 

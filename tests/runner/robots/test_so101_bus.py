@@ -60,9 +60,8 @@ def test_angles_are_read_from_the_servos_counts(hal: HalBase, bus: ServoBus) -> 
 
 def test_targets_reach_the_servos(hal: HalBase, bus: ServoBus) -> None:
     hal.send_action(moving(elbow_flex=-0.5, gripper=RANGES_RAD["gripper"][0]))
-    assert hal.read_state().position[2] == pytest.approx(
-        -0.5, abs=0.002
-    )  # answered after the writes before it
+    # answered after the writes before it
+    assert hal.read_state().position[2] == pytest.approx(-0.5, abs=0.002)
     assert bus.get(3, PRESENT) == pytest.approx(2047 - 0.5 * COUNTS_PER_RAD, abs=2)
     assert bus.get(6, PRESENT) == 0
     assert bus.get(1, PRESENT) == pytest.approx(2047, abs=1)  # was not named

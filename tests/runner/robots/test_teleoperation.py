@@ -179,10 +179,7 @@ async def bench_of(
             sent=parts.hal.sent,
         )
 
-    makers = {
-        Kind.VLA: policy,
-        Kind.ROS_ACTION: StandIns(operator_of(parts, 1 / RATE_HZ), JOINTS),
-    }
+    makers = {Kind.VLA: policy, Kind.ROS_ACTION: StandIns(operator_of(parts, 1 / RATE_HZ), JOINTS)}
     control = await stack.enter_async_context(ControlThread(runner))
     endpoint = f"ipc://{folder}/runner.sock"
     mark = sinks[0].mark if sinks else None
@@ -258,9 +255,7 @@ async def test_an_operator_who_pushes_against_a_limit_does_not_fail_the_goal(rig
     assert (await goal.result(60))["data"]["withheld"] >= 30
 
 
-async def test_a_take_over_ends_the_policys_use_and_gives_back_to_a_fresh_one(
-    rig: Bench,
-) -> None:
+async def test_a_take_over_ends_the_policys_use_and_gives_back_to_a_fresh_one(rig: Bench) -> None:
     goal = await rig.client.send_goal("test/grab", prompt="grab it")
     await rig.until_asked(2)
     assert (await rig.client.take_over("take"))["goal_id"] == goal.goal_id

@@ -106,9 +106,8 @@ def serve_estop(robot: Robot, endpoint: str) -> Callable[..., EstopServer]:
 
 def connect_to(endpoint: str) -> socket.socket:
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    limit = struct.pack(
-        "ll", int(WAIT_S), 0
-    )  # of the kernel: with Python's a full backlog is an error at once
+    # of the kernel: with Python's a full backlog is an error at once
+    limit = struct.pack("ll", int(WAIT_S), 0)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
     connection.connect(path_of(endpoint))
@@ -124,9 +123,8 @@ def test_a_stop_is_answered_while_the_event_loop_stands_still(
 
     async def scenario() -> str:
         with serve_estop():
-            return stop(
-                endpoint, "smoke", timeout_s=WAIT_S
-            ).message  # nothing else runs on this loop until it returns
+            # nothing else runs on this loop until it returns
+            return stop(endpoint, "smoke", timeout_s=WAIT_S).message
 
     assert asyncio.run(scenario()) == "emergency stop: smoke"
 
@@ -273,9 +271,8 @@ def test_what_is_no_request_stops_nothing_and_is_hung_up_on(
             client.send(packet)
             assert client.recv(4096) == b""
         assert robot.estop is None
-        with connect_to(
-            endpoint
-        ) as client:  # any version stops, and a reason that is too long is cut
+        # any version stops, and a reason that is too long is cut
+        with connect_to(endpoint) as client:
             client.send(b"VRAM-ESTOP/7 " + b"x" * 100_000)
             assert reply_in(client.recv(4096)).answer is Answer.LATCHED
 
@@ -312,9 +309,8 @@ def test_the_socket_of_a_killed_runner_is_taken_over_and_nothing_else(
     with pytest.raises(AlreadyRunning, match="not a socket"), serve_estop():
         pass
     with pytest.raises(ConfigError, match="the socket path has"):
-        path_of(
-            f"ipc:///{'x' * 103}"
-        )  # fits the goal socket, and leaves no room for its emergency stop's
+        # fits the goal socket, and leaves no room for its emergency stop's
+        path_of(f"ipc:///{'x' * 103}")
     with pytest.raises(ConfigError, match=r"no-such-folder/s\.estop: No such file"):
         EstopServer(
             f"ipc://{tmp_path}/no-such-folder/s", cast(Any, robot), on_stop=lambda *_: None

@@ -155,9 +155,8 @@ def test_a_target_that_is_no_number_is_withheld_however_it_was_built(
     value: float, kinematic: bool
 ) -> None:
     """Regression: copies of an action are not validated, and every comparison with NaN is false."""
-    action = to_row(0.0, 1.0, 0.5).model_copy(
-        update={"joint_targets": ((value, 1.0, 0.5),)}
-    )  # not validated
+    # not validated
+    action = to_row(0.0, 1.0, 0.5).model_copy(update={"joint_targets": ((value, 1.0, 0.5),)})
     withheld(gate(kinematic=kinematic), action, at(*HERE), "expected a number of rad")
 
 

@@ -161,7 +161,7 @@ def make_rtsp() -> Iterator[Callable[[bytes], FilmServer]]:
 
 
 @pytest.fixture
-def reading() -> Iterator[Callable[[SlotReader], SlotReader]]:
+def started_reader() -> Iterator[Callable[[SlotReader], SlotReader]]:
     """Starts a reader and stops it at the end."""
     started: list[SlotReader] = []
 

@@ -122,7 +122,7 @@ def detections_of(hardware: HardwareRunner) -> tuple[list[str], str]:
     return labels, hardware.world.diagnostics["detector:front"]
 
 
-async def test_detections_are_in_the_world_state_until_they_are_too_old(
+async def test_detections_are_in_the_world_state_until_old(
     detector: ContinuousDetector, hardware: HardwareRunner, model: Model, clock: ManualClock
 ) -> None:
     assert detections_of(hardware) == ([], "stale")  # it has not looked yet
@@ -174,10 +174,8 @@ async def test_an_evicted_model_sees_nothing_and_is_not_brought_back_from_standb
     await detector.look()
     model.resident, model.standby = False, True
     await detector.look()
-    assert detections_of(hardware) == (
-        [],
-        "stale",
-    )  # at once, though the last look was young enough
+    # at once, though the last look was young enough
+    assert detections_of(hardware) == ([], "stale")
     (slot,) = hardware.robot.detections
     assert "evicted" in slot.why
     clock.advance(10 * RELOAD_S)

@@ -111,9 +111,8 @@ def test_colours_and_rows(
 def test_grey(reader: Callable[..., SlotReader]) -> None:
     frame = frame_of(reader(source="test", pattern="white", width=33, height=5, encoding="mono8"))
     assert (frame.channels, len(frame.data or b"")) == (1, 33 * 5)
-    assert (
-        min(frame.data or b"") >= 235
-    )  # white, in the narrower range of video levels at the least
+    # white, in the narrower range of video levels at the least
+    assert min(frame.data or b"") >= 235
 
 
 def test_depth_has_two_bytes(reader: Callable[..., SlotReader]) -> None:

@@ -63,12 +63,12 @@ def wait_for_end(reader: SlotReader) -> str:
 
 
 def test_a_file_is_played_in_order_at_its_rate_and_then_ends(
-    make_video: Callable[..., Path], reading: Reading
+    make_video: Callable[..., Path], started_reader: Reading
 ) -> None:
     shelf = Shelf()
     path = make_video([40, 80, 120, 160, 200], fps=50.0)
     begun_ns = SystemClock().now_ns()
-    reader = reading(reader_of(shelf, path=str(path)))
+    reader = started_reader(reader_of(shelf, path=str(path)))
     assert "video.avi is over after 5 pictures" in wait_for_end(reader)
     assert [grey(frame) for frame in shelf.frames] == pytest.approx([40, 80, 120, 160, 200], abs=3)
     first = shelf.frames[0]
@@ -76,23 +76,25 @@ def test_a_file_is_played_in_order_at_its_rate_and_then_ends(
         "front", "bgr8", 64, 48, 3,
     )  # fmt: skip
     for index, frame in enumerate(shelf.frames):
-        assert (
-            frame.stamp_monotonic_ns - begun_ns >= index * 20_000_000
-        )  # each at its time, never before
+        # each at its time, never before
+        assert frame.stamp_monotonic_ns - begun_ns >= index * 20_000_000
 
 
 def test_the_rate_can_be_given_and_is_kept(
-    make_video: Callable[..., Path], reading: Reading
+    make_video: Callable[..., Path], started_reader: Reading
 ) -> None:
-    slow = make_video(
-        [10, 20, 30], fps=0.02
-    )  # two and a half minutes, longer than the wait for the end
-    assert "over after 3 pictures" in wait_for_end(reading(reader_of(path=str(slow), fps=500.0)))
+    # two and a half minutes, longer than the wait for the end
+    slow = make_video([10, 20, 30], fps=0.02)
+    assert "over after 3 pictures" in wait_for_end(
+        started_reader(reader_of(path=str(slow), fps=500.0))
+    )
 
 
-def test_a_file_that_loops_begins_again(make_video: Callable[..., Path], reading: Reading) -> None:
+def test_a_file_that_loops_begins_again(
+    make_video: Callable[..., Path], started_reader: Reading
+) -> None:
     shelf = Shelf()
-    reader = reading(reader_of(shelf, path=str(make_video([50, 150], fps=200.0)), loop=True))
+    reader = started_reader(reader_of(shelf, path=str(make_video([50, 150], fps=200.0)), loop=True))
     deadline_ns = SystemClock().now_ns() + 60 * 10**9
     while len(shelf.frames) < 5:
         reader.read_synced(deadline_ns)
@@ -102,21 +104,23 @@ def test_a_file_that_loops_begins_again(make_video: Callable[..., Path], reading
     )
 
 
-def test_a_file_that_is_no_video_ends_with_the_reason(tmp_path: Path, reading: Reading) -> None:
+def test_a_file_that_is_no_video_ends_with_the_reason(
+    tmp_path: Path, started_reader: Reading
+) -> None:
     path = tmp_path / "notes.avi"
     path.write_text("not a video\n")
-    assert "cannot be read as a video" in wait_for_end(reading(reader_of(path=str(path))))
+    assert "cannot be read as a video" in wait_for_end(started_reader(reader_of(path=str(path))))
     path.write_text("")
-    assert "cannot be read as a video" in wait_for_end(reading(reader_of(path=str(path))))
+    assert "cannot be read as a video" in wait_for_end(started_reader(reader_of(path=str(path))))
 
 
 @pytest.mark.parametrize(("encoding", "channels"), [("rgb8", 3), ("mono8", 1)])
 def test_encodings(
-    make_video: Callable[..., Path], reading: Reading, encoding: str, channels: int
+    make_video: Callable[..., Path], started_reader: Reading, encoding: str, channels: int
 ) -> None:
     shelf = Shelf()
     wait_for_end(
-        reading(reader_of(shelf, path=str(make_video([90], fps=100.0)), encoding=encoding))
+        started_reader(reader_of(shelf, path=str(make_video([90], fps=100.0)), encoding=encoding))
     )
     frame = shelf.frames[0]
     assert (frame.encoding, frame.channels, len(frame.data or b"")) == (
@@ -153,21 +157,25 @@ def test_a_reader_can_be_started_again(make_video: Callable[..., Path]) -> None:
     assert [grey(frame) for frame in shelf.frames] == pytest.approx([60, 70, 60, 70], abs=3)
 
 
-def test_opencv_works_with_one_thread(make_video: Callable[..., Path], reading: Reading) -> None:
+def test_opencv_works_with_one_thread(
+    make_video: Callable[..., Path], started_reader: Reading
+) -> None:
     import cv2
 
     cv2.setNumThreads(2)
-    wait_for_end(reading(reader_of(path=str(make_video([60], fps=100.0)))))
+    wait_for_end(started_reader(reader_of(path=str(make_video([60], fps=100.0)))))
     assert cv2.getNumThreads() == 1
 
 
 def test_a_stream_that_breaks_off_is_opened_again_and_given_up_in_the_end(
-    make_video: Callable[..., Path], make_rtsp: Callable[[bytes], Any], reading: Reading
+    make_video: Callable[..., Path], make_rtsp: Callable[[bytes], Any], started_reader: Reading
 ) -> None:
     server = make_rtsp(make_video([100] * 50, name="a.ts", fourcc="mpg2").read_bytes())
     shelf = Shelf()
     url = f"rtsp://user:secret@127.0.0.1:{server.port}/front?key=hidden"
-    reader = reading(reader_of(shelf, url=url, reconnect_tries=2, reconnect_s=0.01, timeout_s=20.0))
+    reader = started_reader(
+        reader_of(shelf, url=url, reconnect_tries=2, reconnect_s=0.01, timeout_s=20.0)
+    )
     deadline_ns = SystemClock().now_ns() + 60 * 10**9
     assert grey(reader.read_synced(deadline_ns)) == pytest.approx(96, abs=8)
     before = len(shelf.frames)
@@ -194,7 +202,10 @@ class Shifted(SystemClock):
 
 @pytest.mark.parametrize("stamp", ["source", "arrival"])
 def test_pictures_that_waited_in_the_network_are_as_old_as_they_are(
-    make_video: Callable[..., Path], make_rtsp: Callable[[bytes], Any], reading: Reading, stamp: str
+    make_video: Callable[..., Path],
+    make_rtsp: Callable[[bytes], Any],
+    started_reader: Reading,
+    stamp: str,
 ) -> None:
     server = make_rtsp(make_video([100] * 100, name="a.ts", fourcc="mpg2").read_bytes())
     server.hold = threading.Event()
@@ -202,7 +213,7 @@ def test_pictures_that_waited_in_the_network_are_as_old_as_they_are(
     url = f"rtsp://127.0.0.1:{server.port}/"
     reader = make_reader(camera(url=url, reconnect_tries=0, timeout_s=20.0, stamp=stamp), clock)
     reader._tee = shelf
-    reading(reader)
+    started_reader(reader)
     with reader.slot._changed:
         assert reader.slot._changed.wait_for(lambda: len(shelf.frames) >= 20, 60)
     begun_ns = clock.now_ns()
@@ -215,20 +226,19 @@ def test_pictures_that_waited_in_the_network_are_as_old_as_they_are(
     if stamp == "arrival":
         assert late.stamp_monotonic_ns >= begun_ns + 100 * 10**9
     else:
-        assert (
-            90 < age_s < 170
-        )  # a hundred, less the four that the stream lasts, and what this test took
+        # a hundred, less the four that the stream lasts, and what this test took
+        assert 90 < age_s < 170
         assert late.stamp_wall_ns <= clock.wall_ns() - 90 * 10**9
 
 
-def test_a_device_that_is_not_there_is_tried_and_given_up(reading: Reading) -> None:
-    reader = reading(reader_of(device=NO_DEVICE, reconnect_tries=1, reconnect_s=0.01))
+def test_a_device_that_is_not_there_is_tried_and_given_up(started_reader: Reading) -> None:
+    reader = started_reader(reader_of(device=NO_DEVICE, reconnect_tries=1, reconnect_s=0.01))
     assert f"device {NO_DEVICE} cannot be opened, given up after 1 new tries" in wait_for_end(
         reader
     )
 
 
-def test_stopping_does_not_wait_for_the_next_try(reading: Reading) -> None:
+def test_stopping_does_not_wait_for_the_next_try(started_reader: Reading) -> None:
     reader = reader_of(device=NO_DEVICE, reconnect_tries=5, reconnect_s=3600.0)
     reader.start()
     assert isinstance(reader, OpenCvReader)

@@ -19,11 +19,7 @@ from tests.support.waiting import until
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.sensors import SlotReader
 from vram_arbiter.runner.sensors.factory import make_reader
-from vram_arbiter.runner.sensors.ros2_dds import (
-    dds_topic,
-    domain_of,
-    full_topic,
-)
+from vram_arbiter.runner.sensors.ros2_dds import dds_topic, domain_of, full_topic
 from vram_arbiter.runner.sensors.ros2_dds import reader_of as dds_reader_of
 from vram_arbiter.runner.sensors.ros2_image import RosImagePublisher, RosImageReader
 from vram_arbiter.runner.sensors.ros2_messages import IMAGE
@@ -112,9 +108,9 @@ def why_stale(reader: SlotReader, word: str) -> str:
 
 @pytest.mark.parametrize("reliability", ["best_effort", "reliable"])
 def test_pictures_of_another_node_arrive(
-    topic: str, node: Callable[..., Node], reading: Reading, reliability: str
+    topic: str, node: Callable[..., Node], started_reader: Reading, reliability: str
 ) -> None:
-    reader = reading(reader_of(topic, reliability=reliability))
+    reader = started_reader(reader_of(topic, reliability=reliability))
     publisher = node(topic, "image", "reliable")
     data = os.urandom(64 * 48 * 3)
     before_ns = SystemClock().wall_ns()
@@ -128,11 +124,11 @@ def test_pictures_of_another_node_arrive(
 
 
 def test_a_reader_waits_for_its_publisher_and_says_so(
-    topic: str, node: Callable[..., Node], reading: Reading, caplog: pytest.LogCaptureFixture
+    topic: str, node: Callable[..., Node], started_reader: Reading, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Regression: it was as silent as a broken camera, and given up like one."""
     caplog.set_level(logging.INFO)
-    reader = reading(reader_of(topic))
+    reader = started_reader(reader_of(topic))
     with pytest.raises(FrameStale, match=f"{topic} has no publisher yet") as stale:
         reader.read_latest()
     assert stale.value.details["absent"]
@@ -144,20 +140,20 @@ def test_a_reader_waits_for_its_publisher_and_says_so(
 
 
 def test_a_picture_larger_than_a_datagram_arrives_whole(
-    topic: str, node: Callable[..., Node], reading: Reading
+    topic: str, node: Callable[..., Node], started_reader: Reading
 ) -> None:
-    reader = reading(reader_of(topic, reliability="reliable"))
+    reader = started_reader(reader_of(topic, reliability="reliable"))
     publisher = node(topic, "image", "reliable")
     data = os.urandom(640 * 480 * 3)
     assert picture_now(reader, publisher, data, **image(640, 480, "bgr8")).data == data
 
 
-def test_jpeg_pictures(topic: str, node: Callable[..., Node], reading: Reading) -> None:
+def test_jpeg_pictures(topic: str, node: Callable[..., Node], started_reader: Reading) -> None:
     import cv2
     import numpy as np
 
     data = bytes(cv2.imencode(".jpg", np.full((48, 64, 3), 90, dtype=np.uint8))[1])
-    reader = reading(reader_of(topic + "/compressed", message="compressed"))
+    reader = started_reader(reader_of(topic + "/compressed", message="compressed"))
     publisher = node(topic + "/compressed", "compressed")
     frame = picture_now(reader, publisher, data, format="jpeg")
     assert (frame.encoding, frame.width, frame.height, frame.channels) == ("jpeg", 64, 48, 3)
@@ -165,13 +161,12 @@ def test_jpeg_pictures(topic: str, node: Callable[..., Node], reading: Reading) 
 
 
 def test_age_counts_from_the_header(
-    topic: str, node: Callable[..., Node], reading: Reading
+    topic: str, node: Callable[..., Node], started_reader: Reading
 ) -> None:
-    reader = reading(reader_of(topic, max_age_ms=1_000.0, reliability="reliable"))
+    reader = started_reader(reader_of(topic, max_age_ms=1_000.0, reliability="reliable"))
     publisher = node(topic, "image", "reliable")
-    old_ns = (
-        SystemClock().wall_ns() - 30 * 10**9
-    )  # a machine that has just been started has no longer past
+    # a machine that has just been started has no longer past
+    old_ns = SystemClock().wall_ns() - 30 * 10**9
     slot = reader.slot
     for _ in range(300):  # whoever has matched a reader may not yet have been matched by it
         publisher.publish(bytes(12), old_ns, **image(2, 2))
@@ -186,20 +181,19 @@ def test_age_counts_from_the_header(
 
 
 def test_age_can_count_from_the_arrival(
-    topic: str, node: Callable[..., Node], reading: Reading
+    topic: str, node: Callable[..., Node], started_reader: Reading
 ) -> None:
-    reader = reading(reader_of(topic, stamp="arrival"))
+    reader = started_reader(reader_of(topic, stamp="arrival"))
     publisher = node(topic)
-    frame = picture_now(
-        reader, publisher, bytes(12), stamp_ns=1, **image(2, 2)
-    )  # a clock that begins with the machine
+    # a clock that begins with the machine
+    frame = picture_now(reader, publisher, bytes(12), stamp_ns=1, **image(2, 2))
     assert reader.read_latest().data == frame.data
 
 
 def test_a_picture_that_cannot_be_used_is_not_shown(
-    topic: str, node: Callable[..., Node], reading: Reading
+    topic: str, node: Callable[..., Node], started_reader: Reading
 ) -> None:
-    reader = reading(reader_of(topic, reliability="reliable"))
+    reader = started_reader(reader_of(topic, reliability="reliable"))
     publisher = node(topic, "image", "reliable")
     picture_now(reader, publisher, bytes(12), **image(2, 2))
     publisher.publish(bytes(4), SystemClock().wall_ns(), **image(2, 2, "bayer_rggb8", 1))
@@ -211,9 +205,9 @@ def test_a_picture_that_cannot_be_used_is_not_shown(
 
 
 def test_a_publisher_that_leaves_takes_its_picture_with_it(
-    topic: str, node: Callable[..., Node], reading: Reading
+    topic: str, node: Callable[..., Node], started_reader: Reading
 ) -> None:
-    reader = reading(reader_of(topic))
+    reader = started_reader(reader_of(topic))
     publisher = node(topic)
     picture_now(reader, publisher, bytes(12), **image(2, 2))
     publisher.close()
@@ -259,9 +253,9 @@ def test_the_last_picture_of_a_publisher_that_left_is_not_shown_after_it(topic: 
 
 
 def test_a_publisher_with_another_quality_of_service_is_named(
-    topic: str, node: Callable[..., Node], reading: Reading
+    topic: str, node: Callable[..., Node], started_reader: Reading
 ) -> None:
-    reader = reading(reader_of(topic, reliability="reliable"))
+    reader = started_reader(reader_of(topic, reliability="reliable"))
     node(topic, "image", "best_effort")
     assert "set reliability: best_effort" in why_stale(reader, "best_effort")
 
@@ -283,7 +277,7 @@ def test_stopping_ends_the_thread_and_starting_begins_anew(
 
 
 def test_the_frames_of_any_reader_can_be_published(
-    topic: str, make_video: Callable[..., Path], reading: Reading
+    topic: str, make_video: Callable[..., Path], started_reader: Reading
 ) -> None:
     subscriber = Node(int(DOMAIN), topic, "image", "reliable")
     camera = SensorReaderConfig(
@@ -292,7 +286,7 @@ def test_the_frames_of_any_reader_can_be_published(
         publish_to_ros=True,
         publish_topic=topic,
     )
-    reading(make_reader(camera, SystemClock()))
+    started_reader(make_reader(camera, SystemClock()))
     got = subscriber.take()
     assert (got.width, got.height, got.encoding, got.step) == (64, 48, "bgr8", 64 * 3)
     assert got.header.frame_id == "file"
@@ -317,7 +311,7 @@ def test_the_publisher_keeps_to_its_rate_and_counts_what_it_cannot_send(topic: s
 
 @pytest.mark.parametrize("encoding", [FrameEncoding.DEPTH16, FrameEncoding.JPEG])
 def test_what_is_published_is_read_as_it_was(
-    topic: str, reading: Reading, encoding: FrameEncoding
+    topic: str, started_reader: Reading, encoding: FrameEncoding
 ) -> None:
     import cv2
     import numpy as np
@@ -329,7 +323,7 @@ def test_what_is_published_is_read_as_it_was(
         else bytes(cv2.imencode(".jpg", depth >> 8)[1])
     )
     message = "image" if encoding is FrameEncoding.DEPTH16 else "compressed"
-    reader = reading(reader_of(topic, message=message, reliability="reliable"))
+    reader = started_reader(reader_of(topic, message=message, reliability="reliable"))
     publisher = RosImagePublisher(topic, int(DOMAIN))
     slot, clock = reader.slot, SystemClock()
     for _ in range(300):

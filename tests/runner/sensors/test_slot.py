@@ -199,9 +199,8 @@ def test_a_reader_conforms_starts_again_and_tells_its_tee(clock: Any) -> None:
     with pytest.raises(FrameStale, match="stopped"):
         as_protocol.read_latest()
     as_protocol.start()
-    reader.deliver(
-        reader.feeds[0], frame_at(clock.now_ns(), 2)
-    )  # the thread of the first run, late
+    # the thread of the first run, late
+    reader.deliver(reader.feeds[0], frame_at(clock.now_ns(), 2))
     with pytest.raises(FrameStale):
         as_protocol.read_latest()
     reader.deliver(reader.feeds[1], frame_at(clock.now_ns(), 3))

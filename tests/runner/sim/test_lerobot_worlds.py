@@ -148,7 +148,7 @@ def train(folder: Path, world: World, shown: dict[str, Any]) -> tuple[float, flo
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_a_checkpoint_trained_here_plays_a_world_of_the_field(
+def test_a_trained_checkpoint_plays_a_world_of_the_field(
     name: str,
     tmp_path: Path,
     libero_paths: None,

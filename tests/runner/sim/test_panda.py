@@ -33,7 +33,7 @@ def panda() -> Iterator[ArmEnvironment]:
     world.arm.close()
 
 
-def play(world: ArmEnvironment, seed: int) -> list[Phase]:
+def grab_target(world: ArmEnvironment, seed: int) -> list[Phase]:
     """Grab the target of a seed from 2 cm beside the grasp spot; return the phases of the chunks.
 
     Observations, chunks, rows and the gate are those of a goal; only the socket is left out.
@@ -95,7 +95,7 @@ def test_the_base_drives_and_stays_before_the_counter(panda: ArmEnvironment) -> 
 
 
 def test_the_script_grabs_by_the_twelve_slots_through_the_gate(panda: ArmEnvironment) -> None:
-    phases = play(panda, 2)
+    phases = grab_target(panda, 2)
     assert panda.arm.held_object() == panda.arm.target
     assert phases == sorted(phases, key=list(Phase).index)
     assert set(phases) == set(Phase), "the base is driven first, then the arm moves"
@@ -104,5 +104,5 @@ def test_the_script_grabs_by_the_twelve_slots_through_the_gate(panda: ArmEnviron
 @pytest.mark.nightly
 @pytest.mark.parametrize("seed", range(10))
 def test_ten_seeds(panda: ArmEnvironment, seed: int) -> None:
-    play(panda, seed)
+    grab_target(panda, seed)
     assert panda.arm.held_object() == panda.arm.target

@@ -309,9 +309,8 @@ def test_the_gate_is_a_robots_and_each_skill_tightens_it(make_runner: Make, env:
     ended: list[SkillEnded] = []
     runner.begin_skill(Careful(Act(joints(0.4)), Act(joints(-0.3))), GOAL, ended.append)
     ticks = [runner.tick() for _ in range(3)]
-    assert env.joints["shoulder_pan"] == pytest.approx(
-        0.35
-    )  # 3 rad/s, with the tick between that sent nothing
+    # 3 rad/s, with the tick between that sent nothing
+    assert env.joints["shoulder_pan"] == pytest.approx(0.35)
     assert "is beyond 3.00 rad/s" in ticks[0].safety_violations[0]
     assert [tick.action_applied for tick in ticks] == [True, False, False]
     assert (ended[0].data["clamped"], ended[0].data["withheld"]) == (1, 1)

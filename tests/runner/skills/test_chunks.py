@@ -83,11 +83,8 @@ def test_a_world_that_waits_is_the_same_whenever_answers_come() -> None:
         (2, 0, "00 10 20 30"),  # at once: each row is the first of its own chunk
         (2, 1, "-- 00 01 11 12 21 22"),  # skips what was played since, and no more
         (2, 2, "-- -- 00 01 02 12 13 14 22"),
-        (
-            2,
-            4,
-            "-- -- -- -- 00 01 02 -- -- 12 13 14 -- -- 22",
-        ),  # longer than the rows that are left
+        # longer than the rows that are left
+        (2, 4, "-- -- -- -- 00 01 02 -- -- 12 13 14 -- -- 22"),
         (0, 1, "-- 00 01 02 -- 10 11 12 -- 20"),
     ],
 )

@@ -203,9 +203,8 @@ def test_the_fields_vector_drives_arm_or_base_by_its_mode(panda: Bench) -> None:
     assert panda.tool().xyz - before.xyz == pytest.approx([0, 0, 30 * 0.06 * 0.05], abs=3e-3)
     assert panda.measured()["panda_gripper"] == pytest.approx(0.0, abs=2e-3)
     world = panda.world()
-    assert (
-        world.joint_state.name == panda.robot.joint_names
-    )  # a recording's columns: each has a target
+    # a recording's columns: each has a target
+    assert world.joint_state.name == panda.robot.joint_names
     assert world.base_pose is not None
     assert world.base_twist is not None
     turned = 0.5 * (1.0 + 0.2)

@@ -44,7 +44,7 @@ class Robot:
 
 
 @pytest.fixture
-async def robot(
+async def remote_robot(
     make_arbiter: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> AsyncIterator[Robot]:
     for name in ("HUNG_MIN_S", "HUNG_FIRST_MIN_S", "HUNG_WAITING_MIN_S"):
@@ -83,22 +83,22 @@ async def held(bench: Bench) -> None:
         assert isinstance(await bench.step(), Hold)
 
 
-async def test_a_goal_is_a_use_at_the_servers_arbiter(robot: Robot) -> None:
-    await robot.bench.skill.start(GOAL)
-    assert await robot.uses() == 1
-    await first_action(robot.bench)
-    await robot.bench.skill.finish()
-    await robot.no_uses()
+async def test_a_goal_is_a_use_at_the_servers_arbiter(remote_robot: Robot) -> None:
+    await remote_robot.bench.skill.start(GOAL)
+    assert await remote_robot.uses() == 1
+    await first_action(remote_robot.bench)
+    await remote_robot.bench.skill.finish()
+    await remote_robot.no_uses()
 
 
 async def test_a_killed_tunnel_ends_the_goal_at_once_and_the_next_begins_anew(
-    robot: Robot,
+    remote_robot: Robot,
 ) -> None:
-    bench = robot.bench
+    bench = remote_robot.bench
     await bench.skill.start(GOAL)
     await first_action(bench)
-    robot.remote.sshd.kill(USER)
-    await robot.no_uses()
+    remote_robot.remote.sshd.kill(USER)
+    await remote_robot.no_uses()
     await eventually(lambda: not bench.client.connected)
     with pytest.raises(SidecarUnavailable, match="lost within the goal"):
         await bench.step()
@@ -106,15 +106,15 @@ async def test_a_killed_tunnel_ends_the_goal_at_once_and_the_next_begins_anew(
 
     await eventually(lambda: bench.arbiter.connected)  # type: ignore[union-attr]
     await bench.skill.start(GOAL)
-    assert await robot.uses() == 1, "a new use"
+    assert await remote_robot.uses() == 1, "a new use"
     assert await first_action(bench) == pytest.approx(1), "a new chunk, of a new picture"
 
 
-async def test_a_silent_tunnel_stops_the_robot_at_the_end_of_its_chunk(robot: Robot) -> None:
-    bench = robot.bench
+async def test_a_silent_tunnel_stops_the_robot_at_the_end_of_its_chunk(remote_robot: Robot) -> None:
+    bench = remote_robot.bench
     await bench.skill.start(GOAL)
     await first_action(bench)
-    robot.remote.sshd.freeze(USER)
+    remote_robot.remote.sshd.freeze(USER)
     try:
         outcomes = [await bench.step() for _ in range(3)]
         assert [type(one) for one in outcomes] == [Act, Act, Hold], "the rest of its chunk"
@@ -122,12 +122,12 @@ async def test_a_silent_tunnel_stops_the_robot_at_the_end_of_its_chunk(robot: Ro
             await held(bench)
         await bench.skill.finish()
     finally:
-        robot.remote.sshd.unfreeze(USER)
-    await robot.no_uses()
+        remote_robot.remote.sshd.unfreeze(USER)
+    await remote_robot.no_uses()
 
     await eventually(lambda: bench.arbiter.connected)  # type: ignore[union-attr]
     await bench.skill.start(GOAL)
-    assert await robot.uses() == 1
+    assert await remote_robot.uses() == 1
     newest = await first_action(bench)
     assert newest == pytest.approx(len(bench.sidecar.observations) - 1), "not the late answer"
     assert newest >= 1

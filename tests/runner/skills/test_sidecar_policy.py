@@ -55,7 +55,7 @@ def policy_bench(manifest: RSkillManifest, tmp_path: Path) -> Callable[..., Benc
 
 
 @asynccontextmanager
-async def serve(made: Bench) -> AsyncIterator[Bench]:
+async def served_bench(made: Bench) -> AsyncIterator[Bench]:
     async with made.sidecar.served(made.client.endpoint):
         try:
             yield made
@@ -66,16 +66,14 @@ async def serve(made: Bench) -> AsyncIterator[Bench]:
 
 @pytest.fixture
 async def b(policy_bench: Callable[..., Bench]) -> AsyncIterator[Bench]:
-    async with serve(policy_bench(Arbiter())) as made:
+    async with served_bench(policy_bench(Arbiter())) as made:
         yield made
 
 
 GOAL = Goal("g1", "test/arm-grab", prompt="grab the red cube", deadline_s=20.0)
 
 
-async def test_a_server_of_the_field_plays_a_goal_without_a_lease(
-    policy_bench: Callable[..., Bench],
-) -> None:
+async def test_a_server_of_the_field_needs_no_lease(policy_bench: Callable[..., Bench]) -> None:
     """It knew neither `load` nor our requests, so that no goal began."""
     import numpy as np
 
@@ -120,7 +118,7 @@ async def test_a_policy_with_a_history_sees_consecutive_steps(tmp_path: Path, to
     a manifest could change that, and few do."""
     text = MANIFEST if told == "by the sidecar" else MANIFEST.replace("7,", "7, n_obs_steps: 2,")
 
-    async with serve(Bench(parse_manifest(text), f"ipc://{tmp_path}/grab.sock", None)) as b:
+    async with served_bench(Bench(parse_manifest(text), f"ipc://{tmp_path}/grab.sock", None)) as b:
         b.sidecar.begun = {"n_obs_steps": 2} if told == "by the sidecar" else {}
         for _ in range(2):
             b.position = dict(REST)
@@ -141,7 +139,7 @@ async def test_a_history_has_no_gap_while_the_next_chunk_is_on_its_way(tmp_path:
     seen."""
     text = MANIFEST.replace("steps: 7,", "steps: 7, prefetch_at: 2,")
 
-    async with serve(Bench(parse_manifest(text), f"ipc://{tmp_path}/grab.sock", None)) as b:
+    async with served_bench(Bench(parse_manifest(text), f"ipc://{tmp_path}/grab.sock", None)) as b:
         b.sidecar.begun = {"n_obs_steps": 3, "n_action_steps": 2}
         await b.skill.start(GOAL)
         await b.play()
@@ -158,7 +156,7 @@ async def test_as_many_actions_are_played_as_the_checkpoint_says(tmp_path: Path)
     """Regression: the whole chunk was played where lerobot plays a part of it."""
 
     manifest = parse_manifest(MANIFEST)
-    async with serve(Bench(manifest, f"ipc://{tmp_path}/grab.sock", None)) as b:
+    async with served_bench(Bench(manifest, f"ipc://{tmp_path}/grab.sock", None)) as b:
         b.sidecar.begun = {"n_action_steps": 2}
         await b.skill.start(GOAL)
         rows, _ = await b.play()
@@ -176,7 +174,7 @@ async def test_a_chunk_asked_for_early_is_told_what_is_left_and_begins_behind_it
     )
     degrees = parse_manifest(text.replace("{dim: 2}", "{dim: 2, joint_units: degrees}"))
 
-    async with serve(Bench(degrees, f"ipc://{tmp_path}/grab.sock", None)) as b:
+    async with served_bench(Bench(degrees, f"ipc://{tmp_path}/grab.sock", None)) as b:
         await b.skill.start(GOAL)
         rows, _ = await b.play()
         to_rad = math.pi / 180
@@ -204,7 +202,7 @@ async def test_the_arm_goes_to_its_start_pose_before_the_policy_sees_anything(b:
 async def test_a_lease_that_goes_between_load_and_use_is_loaded_again(
     policy_bench: Callable[..., Bench],
 ) -> None:
-    async with serve(policy_bench(Arbiter(LeaseRevoking("asked to leave")))) as b:
+    async with served_bench(policy_bench(Arbiter(LeaseRevoking("asked to leave")))) as b:
         b.sidecar.load_error = Evicted("just now")
         await b.skill.start(GOAL)
         assert b.sidecar.calls == ["load", "load", "load", "reset"]
@@ -270,7 +268,7 @@ async def test_eviction_in_the_middle_fails_the_goal(b: Bench) -> None:
 
 
 async def test_without_an_arbiter_no_use_is_marked(policy_bench: Callable[..., Bench]) -> None:
-    async with serve(policy_bench(None)) as b:
+    async with served_bench(policy_bench(None)) as b:
         b.sidecar.arbitrated = False
         await b.skill.start(GOAL)
         _, done = await b.play()
@@ -287,7 +285,7 @@ async def test_a_policys_confidence_goes_with_the_actions_of_its_chunk(
     early = manifest.model_copy(
         update={"policy_extras": manifest.policy_extras | {"prefetch_at": 1, "rollout_steps": 6}}
     )
-    async with serve(Bench(early, f"ipc://{tmp_path}/grab.sock", Arbiter())) as b:
+    async with served_bench(Bench(early, f"ipc://{tmp_path}/grab.sock", Arbiter())) as b:
         b.sidecar.confidence = [np.array([0.25, 0.5, 0.75]), 0.125]  # the third chunk has none
         await b.skill.start(GOAL)
         told: dict[int | None, set[float]] = {}
@@ -361,7 +359,7 @@ async def test_a_policy_that_stands_still_has_ended(
 
     patient = manifest.model_copy(update={"policy_extras": {"rollout_steps": 200}})
 
-    async with serve(Bench(patient, f"ipc://{tmp_path}/grab.sock", Arbiter())) as b:
+    async with served_bench(Bench(patient, f"ipc://{tmp_path}/grab.sock", Arbiter())) as b:
         b.sidecar.action = np.full((10, 2), 0.25)
         await b.skill.start(GOAL)
         _, done = await b.play()
@@ -399,7 +397,7 @@ async def test_views_are_cropped_and_averaged_as_trained(
     }
 
     viewing = manifest.model_copy(update={"policy_extras": extras})
-    async with serve(Bench(viewing, f"ipc://{tmp_path}/grab.sock", Arbiter())) as b:
+    async with served_bench(Bench(viewing, f"ipc://{tmp_path}/grab.sock", Arbiter())) as b:
         await b.skill.start(GOAL)
         await b.play()
         assert b.sidecar.observations[0]["observation.images.front"].shape == (1, 1, 3)
@@ -419,7 +417,7 @@ def leading(policy_bench: Callable[..., Bench], **options: Any) -> Bench:
 async def test_a_policy_whose_targets_lead_goes_there_as_fast_as_the_robot_may(
     policy_bench: Callable[..., Bench],
 ) -> None:
-    async with serve(leading(policy_bench, speeds_rad_s={"a": 3.0, "b": 1.5})) as b:
+    async with served_bench(leading(policy_bench, speeds_rad_s={"a": 3.0, "b": 1.5})) as b:
         import numpy as np
 
         b.sidecar.action = np.array([[0.9, -0.9]] * 3, dtype=np.float32)
@@ -440,7 +438,7 @@ async def test_a_policy_whose_targets_lead_steps_from_what_was_really_sent(
     motors = {"a": 0.0, "b": 0.5}
 
     made = leading(policy_bench, speeds_rad_s={"a": 3.0, "b": 1.5}, sent=lambda: motors)
-    async with serve(made) as b:
+    async with served_bench(made) as b:
         import numpy as np
 
         b.sidecar.action = np.array([[0.9, -0.9]] * 3, dtype=np.float32)
@@ -459,7 +457,9 @@ async def test_steps_of_joints_begin_at_the_motors_targets_and_a_policy_may_end_
         " {range: [2, 2], terminate: true}]}",
     )
 
-    async with serve(Bench(parse_manifest(text), f"ipc://{tmp_path}/grab.sock", Arbiter())) as b:
+    async with served_bench(
+        Bench(parse_manifest(text), f"ipc://{tmp_path}/grab.sock", Arbiter())
+    ) as b:
         import numpy as np
 
         b.sidecar.action = np.array([[0.1, 0.0, 0.0], [0.0, -0.2, 0.4]], dtype=np.float32)

@@ -25,12 +25,7 @@ from vram_arbiter.runner.skills.ros_standins import (
 )
 from vram_arbiter.runner.skills.trajectory import ARRIVE_S, FollowJointTrajectory
 from vram_arbiter.schemas.control import ControlMode
-from vram_arbiter.schemas.errors import (
-    BadRequest,
-    GoalRejected,
-    ModelError,
-    PathToleranceViolated,
-)
+from vram_arbiter.schemas.errors import BadRequest, GoalRejected, ModelError, PathToleranceViolated
 from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
 from vram_arbiter.schemas.world import JointState, WorldState
 

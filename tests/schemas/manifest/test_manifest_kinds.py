@@ -81,11 +81,8 @@ def test_missing_required_field_is_refused(cell: tuple[Kind, str], how: str) -> 
 def test_free_field_is_accepted_and_may_be_left_out(cell: tuple[Kind, str]) -> None:
     kind, field = cell
     assert problems(sample_of(kind) | {field: VALUES[field]}) == set()
-    if field not in (
-        "chunk_size",
-        "actions",
-        "processors",
-    ):  # required of every kind, or by the family
+    # required of every kind, or by the family
+    if field not in ("chunk_size", "actions", "processors"):
         data = sample_of(kind)
         data.pop(field, None)
         assert problems(data) == set()

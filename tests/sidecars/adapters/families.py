@@ -9,10 +9,7 @@ import pytest
 
 from tests.sidecars.adapters import backbone_policies, policies
 from tests.sidecars.adapters.policies import DIM, FRONT, ONLY_CAMERA, SIDE_PX, STATE, TASK, WRIST
-from vram_arbiter.schemas.errors import (
-    ModelError,
-    VramError,
-)
+from vram_arbiter.schemas.errors import ModelError, VramError
 from vram_arbiter.schemas.manifest import ModelFamily, RSkillManifest, parse_manifest
 from vram_arbiter.schemas.manifest.vocabulary import PROCESSOR_FAMILIES
 from vram_arbiter.schemas.sidecar import EndpointCall
@@ -126,7 +123,7 @@ def history(steps: list[dict[str, Any]], at: int, length: int) -> dict[str, Any]
     return stacked([steps[max(0, place)] for place in range(at + 1 - length, at + 1)])
 
 
-def served(adapter: PolicyAdapter, steps: list[dict[str, Any]]) -> Any:
+def answered_episode(adapter: PolicyAdapter, steps: list[dict[str, Any]]) -> Any:
     """Return the actions of one episode, played as they are answered."""
     import numpy as np
     import torch

@@ -17,6 +17,7 @@ from tests.sidecars.adapters import policies
 from tests.sidecars.adapters.families import (
     NAMES,
     SEED,
+    answered_episode,
     ask,
     begin,
     copied,
@@ -29,17 +30,11 @@ from tests.sidecars.adapters.families import (
     manifest_text,
     observations,
     prepared,
-    served,
     stacked,
     swept,
 )
 from tests.sidecars.adapters.policies import DIM, FRONT, ONLY_CAMERA, STATE
-from vram_arbiter.schemas.errors import (
-    BadRequest,
-    ConfigError,
-    ModelError,
-    UnsupportedQuantization,
-)
+from vram_arbiter.schemas.errors import BadRequest, ConfigError, ModelError, UnsupportedQuantization
 from vram_arbiter.schemas.manifest import ModelFamily, parse_manifest
 from vram_arbiter.schemas.sidecar import EndpointCall
 from vram_arbiter.sidecars.adapters.choose import make_adapter
@@ -75,7 +70,7 @@ def test_actions_are_lerobots_own(checkpoint: Callable[[str], Weights], name: st
 
     expected = lerobots_own(weights, steps)
     for goal in range(2):
-        np.testing.assert_array_equal(served(adapter, steps), expected, f"goal {goal}")
+        np.testing.assert_array_equal(answered_episode(adapter, steps), expected, f"goal {goal}")
     length, played = begin(adapter)
     assert played == rows
     assert (length > 1) is (name in ("diffusion", "vqbet", "multi_task_dit"))
@@ -108,7 +103,7 @@ def test_a_manifest_may_say_how_many_actions_are_played(
     if hasattr(adapter._config, "horizon") and name != "tdmpc":
         steps = observations(2 * most + 1)
         expected = lerobots_own(weights, steps, n_action_steps=most)
-        np.testing.assert_array_equal(served(adapter, steps), expected)
+        np.testing.assert_array_equal(answered_episode(adapter, steps), expected)
     for fields, told in (
         ({"n_action_steps": most + 1}, f"is {most + 1}, the checkpoint allows {most}"),
         ({"chunk_size": chunk + 1}, f"is {chunk + 1}, the checkpoint answers {chunk}"),
@@ -140,7 +135,7 @@ def test_a_history_takes_every_control_step_or_refuses(
     assert ask(adapter, stacked(steps[2:])).shape == first.shape, "all of it, whatever was before"
     single = load_policy("diffusion", weights, n_action_steps=1)
     expected = lerobots_own(weights, steps, n_action_steps=1)
-    np.testing.assert_array_equal(served(single, steps), expected)
+    np.testing.assert_array_equal(answered_episode(single, steps), expected)
     begin(single)
     import torch
 
@@ -208,7 +203,7 @@ def test_lingbot_replays_every_control_step(checkpoint: Callable[[str], Weights]
         actions += [*ask(adapter, stacked(steps[1:5])), *ask(adapter, stacked(steps[5:13]))]
         np.testing.assert_array_equal(np.stack(actions), expected, f"goal {goal}")
         adapter.run(EndpointCall(endpoint="reset"))
-    np.testing.assert_array_equal(served(adapter, steps), expected, "as the runner asks")
+    np.testing.assert_array_equal(answered_episode(adapter, steps), expected, "as the runner asks")
     assert begin(adapter) == (8, 8)
     policy = adapter._policy
     ask(adapter, steps[0])
@@ -288,7 +283,7 @@ def test_relative_actions_are_relative_to_the_state_of_their_chunk(
     adapter = load_policy(name, weights)
     steps = observations(3)
 
-    anchored = served(adapter, steps)
+    anchored = answered_episode(adapter, steps)
     drifting = lerobots_own(weights, steps)
     np.testing.assert_array_equal(anchored[0], drifting[0])
     moved = np.stack([step[STATE] - steps[0][STATE] for step in steps])
@@ -385,7 +380,7 @@ def test_an_action_that_never_moved_is_no_defect(
 
     change(folder, "policy_*.safetensors", still)
     steps = observations(3)
-    found = served(load_policy(name, weights), steps)
+    found = answered_episode(load_policy(name, weights), steps)
     np.testing.assert_array_equal(found, lerobots_own(weights, steps))
     assert np.ptp(found[:, 2]) < 1e-6
     change(folder, "policy_pre*.safetensors", lambda tensors: still(tensors, STATE))

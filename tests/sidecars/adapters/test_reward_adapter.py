@@ -115,9 +115,8 @@ def test_pictures_that_do_not_go_together_are_refused(
     with pytest.raises(BadRequest, match="pixels"):
         score(shipped_adapter, *[png(4000, 4000)] * 2)
     with pytest.raises(BadRequest, match="pixels"):
-        score(
-            shipped_adapter, *[png(4000, 4000)[:100]] * 2
-        )  # looked at no further than their headers
+        # looked at no further than their headers
+        score(shipped_adapter, *[png(4000, 4000)[:100]] * 2)
 
 
 # -- a reward model that somebody else registers

@@ -76,7 +76,7 @@ def by_transformers(adapter, pictures):
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("family", FAMILIES)
-def test_each_family_answers_about_several_pictures(family, loaded, manifest, png):
+def test_each_family_takes_several_pictures(family, loaded, manifest, png):
     """In 16 bits; LLaVA-OneVision took two pictures for those of two prompts."""
     adapter = loaded(family, dtype := "fp16" if family == "qwen3_5" else "bf16")
     (network,) = adapter.networks

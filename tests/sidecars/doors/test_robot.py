@@ -49,9 +49,7 @@ def test_observations_are_chosen_as_by_lerobots_server(
     from lerobot.async_inference.policy_server import PolicyServer
 
     theirs = PolicyServer(PolicyServerConfig())
-    theirs.lerobot_features = {
-        STATE: {"dtype": "float32", "shape": (2,), "names": ["a", "b"]},
-    }
+    theirs.lerobot_features = {STATE: {"dtype": "float32", "shape": (2,), "names": ["a", "b"]}}
     steps = [
         seen(0, 0.0, must_go=True), seen(0, 0.5), seen(0, 5.0), seen(1, 0.5), seen(1, 1.5),
         seen(1, 4.0), seen(1, 9.0, must_go=True), seen(2, 9.99), seen(3, 10.01), seen(1, 20.0),
@@ -102,9 +100,7 @@ def test_after_a_failure_the_next_observation_is_looked_at(short_folder: Path) -
     at_sidecar(short_folder, story)
 
 
-def test_a_policy_with_a_history_gets_the_control_steps_that_were_sent(
-    short_folder: Path,
-) -> None:
+def test_a_policy_with_a_history_gets_the_control_steps_that_were_sent(short_folder: Path) -> None:
     """In the place of a step that the robot did not send stands the next one."""
 
     async def story(robot: Robot, sidecar: Sidecar) -> None:

@@ -60,6 +60,10 @@ class GatewayProcess:
         found = self.client.get("/running").json()["running"]
         return {one["model"]: one for one in found}
 
+    def pid_of(self, model: str) -> int:
+        """Ask a stand-in for its pid, which starts it."""
+        return int(self.client.get(f"/upstream/{model}/x").json()["pid"])
+
     def logs(self) -> str:
         return self.client.get("/logs").text
 

@@ -63,10 +63,6 @@ async def ask(client: Any, model: str, **fields: object) -> str:
     return str(answer.choices[0].message.content)
 
 
-def pid_of(gateway: GatewayProcess, name: str) -> int:
-    return int(gateway.client.get(f"/upstream/{name}/x").json()["pid"])
-
-
 # -- a stock client
 async def test_the_first_request_starts_its_server_and_an_idle_one_leaves(
     gateway: Start, arbiter_daemon: ArbiterProcess, monkeypatch: pytest.MonkeyPatch
@@ -168,15 +164,15 @@ async def test_a_sleeping_server_wakes_for_a_request_and_not_before(
     started = gateway(
         {"a": stand_in(arbiter_daemon, 5, on_evict="vllm"), "b": stand_in(arbiter_daemon, 5)}
     )
-    pid = await asyncio.to_thread(pid_of, started, "a")
+    pid = await asyncio.to_thread(started.pid_of, "a")
     with Client("t", endpoint=arbiter_daemon.endpoint) as arbiter:
         for _ in range(2):
-            await asyncio.to_thread(pid_of, started, "b")
+            await asyncio.to_thread(started.pid_of, "b")
             assert view_of(arbiter, "a").state == "parked"
             unload = await asyncio.to_thread(started.client.get, "/unload?model=b")
             assert unload.status_code == 200
             await eventually(lambda: not started.running())  # `a` sleeps on beside an empty GPU
-            assert await asyncio.to_thread(pid_of, started, "a") == pid
+            assert await asyncio.to_thread(started.pid_of, "a") == pid
     assert started.running()["a"]["switches"] == 3
 
 
@@ -267,7 +263,7 @@ async def test_a_server_that_dies_says_why_and_is_started_again(
         assert raised.value.status_code == 502
         assert "exit code 5" in str(raised.value)
         assert "no such model" in str(raised.value)
-        pid = await asyncio.to_thread(pid_of, started, "a")
+        pid = await asyncio.to_thread(started.pid_of, "a")
         with started.client.stream("GET", "/logs/stream/a?no-history") as followed:
             with pytest.raises(openai.InternalServerError, match="about to die"):
                 await client.chat.completions.create(
@@ -276,7 +272,7 @@ async def test_a_server_that_dies_says_why_and_is_started_again(
             lines = followed.iter_lines()
             assert await asyncio.to_thread(next, lines) == "a: about to die"
         await eventually(lambda: "a" not in started.running())
-        assert await asyncio.to_thread(pid_of, started, "a") != pid
+        assert await asyncio.to_thread(started.pid_of, "a") != pid
 
 
 @pytest.mark.nightly
@@ -295,7 +291,7 @@ async def test_a_killed_gateway_leaves_nothing_behind(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:
     started = gateway({"a": stand_in(arbiter_daemon, 1)})
-    pid = await asyncio.to_thread(pid_of, started, "a")
+    pid = await asyncio.to_thread(started.pid_of, "a")
     started.process.kill()
     await eventually(lambda: not alive(pid))
     with Client("t", endpoint=arbiter_daemon.endpoint) as arbiter:
@@ -307,10 +303,10 @@ async def test_a_killed_server_is_started_again(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:
     started = gateway({"a": stand_in(arbiter_daemon, 1)})
-    pid = await asyncio.to_thread(pid_of, started, "a")
+    pid = await asyncio.to_thread(started.pid_of, "a")
     os.kill(pid, signal.SIGKILL)
     await eventually(lambda: "a" not in started.running())
-    assert await asyncio.to_thread(pid_of, started, "a") != pid
+    assert await asyncio.to_thread(started.pid_of, "a") != pid
 
 
 async def test_vramctl_run_listens_for_one_server_without_a_file(
@@ -458,7 +454,7 @@ async def test_a_slow_reader_does_not_fill_memory(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:
     started = gateway({"a": stand_in(arbiter_daemon, 1)})
-    await asyncio.to_thread(pid_of, started, "a")
+    await asyncio.to_thread(started.pid_of, "a")
     before = rss_bytes(started.process.pid)
     async with (
         httpx.AsyncClient(timeout=PATIENCE_S) as client,

@@ -118,7 +118,7 @@ def test_groups_need_nothing_but_persistent_ones_a_priority(place: str) -> None:
     }
     assert found.left == []
     assert [note.partition(":")[0] for note in found.noted] == [
-        *("groups, matrix", "groups.kept.persistent", "fifo.priority.a"),
+        *("groups, matrix", "groups.kept.persistent", "fifo.priority.a")
     ]
 
 

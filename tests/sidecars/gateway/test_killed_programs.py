@@ -26,10 +26,6 @@ def state(gateway: GatewayProcess, name: str) -> str:
     return str(gateway.running().get(name, {}).get("lease", "away"))
 
 
-def pid_of(gateway: GatewayProcess, name: str) -> int:
-    return int(gateway.client.get(f"/upstream/{name}/x").json()["pid"])
-
-
 @asynccontextmanager
 async def chat(
     gateway: GatewayProcess, model: str, user: str | None = None
@@ -56,7 +52,7 @@ async def test_a_server_killed_in_a_stream_breaks_it_and_is_started_again(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:
     started = gateway({name: stand_in(arbiter_daemon, 5) for name in "ab"})
-    pid = await asyncio.to_thread(pid_of, started, "a")
+    pid = await asyncio.to_thread(started.pid_of, "a")
     started.let("u", 0)
     async with chat(started, "a", "u") as answer:
         assert await answer.content.readany()
@@ -86,7 +82,7 @@ async def test_a_gateway_killed_in_any_state_leaves_no_server_and_no_lease(
     gateway: Start, arbiter_daemon: ArbiterProcess, when: str
 ) -> None:
     started = gateway({name: stand_in(arbiter_daemon, 5) for name in "ab"})
-    pid = await asyncio.to_thread(pid_of, started, "a")
+    pid = await asyncio.to_thread(started.pid_of, "a")
     started.let("u", 0)
     async with chat(started, "a", "u") as answer:
         assert await answer.content.readany()

@@ -99,9 +99,8 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         self.frozen = False
         self.on_failure: Callable[[BaseException], None] | None = None
         self._deferred: list[Callback] = []
-        self._tasks: list[
-            asyncio.Task[Any]
-        ] = []  # kept alive: a task of a killed process just never goes on
+        # kept alive: a task of a killed process just never goes on
+        self._tasks: list[asyncio.Task[Any]] = []
 
     # -- the process
     def freeze(self) -> None:

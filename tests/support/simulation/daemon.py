@@ -69,9 +69,8 @@ class Machine:
     boot: int = 1
     alive: dict[int, ProcessKey] = field(default_factory=dict)  # by pid
     history: list[Happening] = field(default_factory=list)
-    tokens: dict[str, tuple[int, int]] = field(
-        default_factory=dict
-    )  # by lease, as the journal had it last
+    # by lease, as the journal had it last
+    tokens: dict[str, tuple[int, int]] = field(default_factory=dict)
     epochs: list[int] = field(default_factory=list)
     slept_s: float = 0.0  # of a suspend that the daemon has not noticed yet
 

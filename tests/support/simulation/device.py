@@ -133,9 +133,8 @@ class ProbeFaults:
     unnamed_bytes: bool = False  # a list without bytes
     factor: float = 1.0  # > 1: says that more is used than is; < 1: less
     forgets_the_dead: bool = False  # the list leaves a dying process out before its bytes are back
-    blind_to: set[ProcessKey] = field(
-        default_factory=set
-    )  # processes that the list leaves out, the total does not
+    # processes that the list leaves out, the total does not
+    blind_to: set[ProcessKey] = field(default_factory=set)
 
 
 class SimProber:

@@ -295,7 +295,7 @@ def test_renewing_keeps_alive_and_never_resurrects(driver: CoreDriver) -> None:
 
 
 # -- leaving
-def test_unloading_waits_for_the_safe_point_whoever_marked_the_use(driver: CoreDriver) -> None:
+def test_unloading_waits_for_a_safe_point(driver: CoreDriver) -> None:
     det, runner = driver.consumer("det"), driver.consumer("runner")
     lease = det.acquire(5 * GIB)
     assert refusal(det.unloading(lease)).code == "bad_state"

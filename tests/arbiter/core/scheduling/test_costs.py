@@ -108,7 +108,7 @@ class Pair:
         return waited
 
 
-def test_two_that_throw_each_other_out_stay_for_what_a_switch_costs() -> None:
+def test_mutual_evictors_stay_for_what_a_switch_costs() -> None:
     pair = Pair()
     assert pair.switch(pair.want()) < 0.1, "the first time"
     assert pair.switch(pair.want()) < 0.1, "and back: only now they have switched both ways"

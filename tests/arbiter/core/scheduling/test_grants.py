@@ -208,7 +208,7 @@ def test_pressure_that_cannot_be_covered_asks_every_idle_holder(driver: CoreDriv
     driver.device.total_bytes = 16 * GIB
 
 
-def test_a_holder_above_its_charge_is_pressure_not_a_stowaway(driver: CoreDriver) -> None:
+def test_a_holder_above_its_charge_is_pressure(driver: CoreDriver) -> None:
     liar, _ = in_use(driver, "liar", 3)
     _, idle = held(driver, "idle", 4, min_residency_s=5.0)
     liar.hold(5 * GIB)

@@ -48,7 +48,7 @@ def test_what_standby_looks_like(driver: CoreDriver) -> None:
     assert (why["state"], why["back"], why["ahead"]) == ("standby", "left_for", "policy")
 
 
-def test_it_never_comes_back_beside_the_one_that_it_left_for() -> None:
+def test_it_never_returns_beside_its_evictor() -> None:
     """Even where both would fit: loading beside a running policy takes time from it."""
     driver = CoreDriver(10 * GIB)
     other, resident = held(driver, "vlm", 4)

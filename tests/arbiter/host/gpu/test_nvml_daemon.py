@@ -88,9 +88,8 @@ def test_a_cycle_with_release_lag(
     assert gpu["capacity_bytes"] == 8 * GIB - 256 * MIB, "less what the driver keeps"
     assert client.ask("subscribe")["ok"]
     on = held_here(client, nvml, 5 * GIB)
-    let_go(
-        client, nvml, on, 5 * GIB, f"process 0 compute {ME} {5 * GIB}"
-    )  # the driver takes its time
+    # the driver takes its time
+    let_go(client, nvml, on, 5 * GIB, f"process 0 compute {ME} {5 * GIB}")
     waiter = client.acquire("next", 5 * GIB, nonce="next")
     assert waiter["state"] == "queued", "released is not free"
     event(client, "queued", lambda told: told["lease_id"] == waiter["lease"]["lease_id"])

@@ -131,7 +131,7 @@ def test_sigterm_loses_nothing_and_the_trace_is_the_starters() -> None:
     assert (span.service, span.trace_id, span.parent_id) == ("tool", TRACE, PARENT)
 
 
-def test_nobody_asked_nothing_is_imported_or_changed() -> None:
+def test_unasked_nothing_is_imported_or_changed() -> None:
     process = program(
         "print([name for name in sys.modules if name.startswith('opentelemetry')],"
         " signal.getsignal(signal.SIGTERM) is signal.SIG_DFL, threading.active_count())"

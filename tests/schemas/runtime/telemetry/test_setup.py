@@ -198,15 +198,14 @@ assert tracing.log_ids() == {}
 
 
 @needs_sdk
-def test_spans_and_metrics_reach_the_collector_at_the_programs_end() -> None:
+def test_spans_and_metrics_are_sent_at_the_end() -> None:
     with Collector() as collector:
         environ = {
             "OTEL_EXPORTER_OTLP_ENDPOINT": collector.endpoint,
             "OTEL_RESOURCE_ATTRIBUTES": "robot.model=so101-b",
         }
-        result = run_program(
-            PROGRAM, environ
-        )  # nothing is due before the end: it is the end that sends
+        # nothing is due before the end: it is the end that sends
+        result = run_program(PROGRAM, environ)
         assert (result.returncode, result.stderr) == (0, "")
         tick, sent, goal = collector.spans()
         assert [tick.name, goal.name] == ["rskill.tick", "rskill.goal"]
@@ -238,7 +237,7 @@ def test_spans_and_metrics_reach_the_collector_at_the_programs_end() -> None:
 
 @needs_sdk
 @pytest.mark.parametrize(("given", "interval_ms"), [("", 5000.0), ("20000", 20000.0)])
-def test_metrics_leave_every_five_seconds_unless_the_environment_says_another(
+def test_metrics_leave_every_five_seconds(
     given: str, interval_ms: float, variables: Variables
 ) -> None:
     variables({"OTEL_METRIC_EXPORT_INTERVAL": given, "OTEL_METRICS_EXPORTER": "console"})
@@ -251,7 +250,7 @@ def test_metrics_leave_every_five_seconds_unless_the_environment_says_another(
 
 
 @needs_sdk
-def test_prometheus_is_read_on_loopback_and_not_after_the_end() -> None:
+def test_prometheus_is_read_on_loopback_until_the_end() -> None:
     port = str(free_port())
     result = run_program(
         "import http.client\n"
