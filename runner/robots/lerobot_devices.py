@@ -12,7 +12,7 @@ import pkgutil
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from vram_arbiter.runner.robots.params import wrong
+from vram_arbiter.runner.params import wrong
 from vram_arbiter.runner.robots.units import JointUnit
 from vram_arbiter.schemas.findings import did_you_mean
 
@@ -20,7 +20,6 @@ LEROBOT = "lerobot:"
 
 
 Word = Literal["robot", "teleoperator"]
-SECTIONS: dict[Word, str] = {"robot": "hal", "teleoperator": "teleop"}  # of the deployment file
 
 
 def make_device(word: Word, kind: str, transport: Mapping[str, Any]) -> Any:
@@ -28,37 +27,36 @@ def make_device(word: Word, kind: str, transport: Mapping[str, Any]) -> Any:
 
     Args: `transport` are the fields of lerobot's configuration. Raises ConfigError.
     """
-    section = SECTIONS[word]
     try:
         package = importlib.import_module(f"lerobot.{word}s")
         registry = getattr(package, f"{word.capitalize()}Config")
         make = getattr(package, f"make_{word}_from_config")
     except ImportError as error:
         problem = f"{LEROBOT}{kind} needs lerobot: pip install 'vram-arbiter[sidecars]' ({error})"
-        raise wrong(("adapter",), problem, section) from error
+        raise wrong("adapter", problem) from error
     known = _types(package, registry, kind)
     if kind not in known:
         problem = f"lerobot knows no {word} {kind!r}{did_you_mean(kind, known)}"
-        raise wrong(("adapter",), problem, section)
+        raise wrong("adapter", problem)
     config_class = registry.get_choice_class(kind)
     fields = {field.name for field in dataclasses.fields(config_class) if field.init}
     if transport.get("cameras"):
-        raise wrong(("transport", "cameras"), "cameras belong under `sensors`", section)
+        raise wrong("transport.cameras", "cameras belong under `sensors`")
     for key in transport:
         if key not in fields:
             problem = f"unknown key{did_you_mean(key, sorted(fields))}"
-            raise wrong(("transport", key), problem, section)
+            raise wrong(f"transport.{key}", problem)
     import draccus
 
     try:
         # lerobot's own reader: it turns texts into the types of its fields
         return make(draccus.decode(config_class, dict(transport)))
     except draccus.utils.DecodingError as error:
-        path = tuple(str(part) for part in getattr(error, "key_path", ()))
+        path = (str(part) for part in getattr(error, "key_path", ()))
         text = str(getattr(error, "message", error))
-        raise wrong(("transport", *path), text, section) from error
+        raise wrong(".".join(("transport", *path)), text) from error
     except (ImportError, TypeError, ValueError, OSError) as error:
-        raise wrong(("transport",), f"lerobot cannot make a {kind}: {error}", section) from error
+        raise wrong("transport", f"lerobot cannot make a {kind}: {error}") from error
 
 
 def _types(package: Any, registry: Any, wanted: str) -> list[str]:

@@ -1,38 +1,26 @@
-"""`hal.params` of the adapters: their fields, and how a mistake in them is told.
-
-Every mistake is a ConfigError that names the field.
-"""
+"""`hal.params` of the adapters."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
+from vram_arbiter.runner.params import Params, mistakes
 from vram_arbiter.runner.robots.lerobot_robot import Estop
 from vram_arbiter.runner.robots.units import JointUnit
-from vram_arbiter.schemas.config.robot import HalConfig
-from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.findings import Path, did_you_mean, dotted, problems_of
+from vram_arbiter.schemas.findings import did_you_mean, dotted
 from vram_arbiter.schemas.manifest.vocabulary import GripperConvention
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.yamltext import Mistake, config_error
 
-SOURCE = "deployment"  # of mistakes, until the deployment file gives them its name and lines
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-
-
-class Params(BaseModel):
-    """Base of all: an unknown field is an error."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class TwinParams(Params):
     """`params` of the twins. Angles in rad by joint; joints left out start in the rest pose."""
 
-    start_pose_rad: dict[str, Finite] = {}
+    start_pose_rad: dict[str, Finite] = Field(default_factory=dict)
 
 
 class JointParams(Params):
@@ -80,8 +68,8 @@ class ModelParams(Params):
     """
 
     model: str = ""
-    ends: dict[str, EndParams] = {}
-    frames: dict[str, str] = {}
+    ends: dict[str, EndParams] = Field(default_factory=dict)
+    frames: dict[str, str] = Field(default_factory=dict)
     units: UnitParams = UnitParams()
 
 
@@ -109,43 +97,23 @@ class ModelTwinParams(ModelParams):
 
     joints: Annotated[dict[str, ModelJointParams], Field(min_length=1)]
     base: BaseParams | None = None
-    rest_pose_rad: dict[str, Finite] = {}
-    start_pose_rad: dict[str, Finite] = {}
+    rest_pose_rad: dict[str, Finite] = Field(default_factory=dict)
+    start_pose_rad: dict[str, Finite] = Field(default_factory=dict)
 
 
 class LerobotParams(ModelParams):
     """`params` of `lerobot:TYPE`. `so101_follower` needs none of them."""
 
-    joints: dict[str, JointParams] = {}
-    rest_pose_rad: dict[str, Finite] = {}
+    joints: dict[str, JointParams] = Field(default_factory=dict)
+    rest_pose_rad: dict[str, Finite] = Field(default_factory=dict)
     estop: Estop = "hold"
 
 
-def wrong(path: Path, problem: str, section: str = "hal") -> ConfigError:
-    """Return one mistake below a section of the file."""
-    return config_error(SOURCE, [Mistake(0, dotted((section, *path)), problem)])
-
-
-def read_params[T: Params](kind: type[T], config: HalConfig) -> T:
-    """Return `hal.params`. Raises ConfigError with every mistake."""
-    try:
-        return kind.model_validate(config.params)
-    except ValidationError as error:
-        problems = [
-            Mistake(0, f"hal.params.{found.field}", found.message)
-            for found in problems_of(error, kind, config.params)
-        ]
-        raise config_error(SOURCE, problems) from error
-
-
-def check_joints(given: JsonMap, names: tuple[str, ...], path: Path) -> None:
-    """Raise ConfigError for each key of `given`, at `path`, that is no joint."""
-    problems = [
-        Mistake(
-            0, dotted(("hal", "params", *path, name)), f"no such joint{did_you_mean(name, names)}"
+def check_joints(given: JsonMap, names: tuple[str, ...], field: str) -> None:
+    """Raise ConfigError for each key of `given`, at `params.field`, that is no joint."""
+    unknown = [name for name in given if name not in names]
+    if unknown:
+        raise mistakes(
+            (dotted(("params", field, name)), f"no such joint{did_you_mean(name, names)}")
+            for name in unknown
         )
-        for name in given
-        if name not in names
-    ]
-    if problems:
-        raise config_error(SOURCE, problems)

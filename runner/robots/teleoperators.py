@@ -15,9 +15,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.runner.control.clock import Clock, SystemClock
+from vram_arbiter.runner.params import wrong
 from vram_arbiter.runner.protocols import RobotDescription
 from vram_arbiter.runner.robots.lerobot_devices import LEROBOT, bus_unit, make_device
-from vram_arbiter.runner.robots.params import wrong
 from vram_arbiter.runner.robots.units import POSITION, JointUnit, LerobotUnits, Scale
 from vram_arbiter.schemas.config.robot import TeleopConfig
 from vram_arbiter.schemas.errors import RobotFault, StateStale
@@ -191,26 +191,22 @@ def make_teleoperator(
     """
     kind = config.adapter.removeprefix(LEROBOT)
     if kind == config.adapter:
-        raise _misfit(f"unknown adapter {kind!r}{did_you_mean(kind, (LEROBOT + 'TYPE',))}")
+        raise wrong("adapter", f"unknown adapter {kind!r}{did_you_mean(kind, (LEROBOT + 'TYPE',))}")
     device = make_device("teleoperator", kind, config.transport)
     if kind == KEYBOARD:
         return Keyboard(device, robot.joint_names, period_s=period_s, clock=clock)
     if units is None:
-        raise _misfit(f"lerobot has no names and units for {robot.name}")
+        raise wrong("adapter", f"lerobot has no names and units for {robot.name}")
     known = [name + POSITION for name in units.scales]
     if others := [name for name in device.action_features if name not in known]:
-        raise _misfit(f"{config.adapter} gives {', '.join(others)}; the robot has no such joint")
+        raise wrong(
+            "adapter", f"{config.adapter} gives {', '.join(others)}; the robot has no such joint"
+        )
     names = [name.removesuffix(POSITION) for name in device.action_features]
     scales = {name: units.scales[name] for name in names}
     for name, scale in scales.items():
         unit = bus_unit(device, name)
         in_degrees = math.isclose(abs(scale.scale), math.radians(1.0))
         if unit is not None and (unit is JointUnit.DEG) is not in_degrees:
-            raise wrong(
-                ("transport",), f"{name} comes in {unit}, not in the robot's unit", "teleop"
-            )
+            raise wrong("transport", f"{name} comes in {unit}, not in the robot's unit")
     return Leader(device, scales, period_s=period_s, clock=clock)
-
-
-def _misfit(problem: str) -> Exception:
-    return wrong(("adapter",), problem, "teleop")

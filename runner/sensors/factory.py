@@ -10,7 +10,7 @@ import importlib
 from collections.abc import Mapping
 
 from vram_arbiter.runner.control.clock import Clock
-from vram_arbiter.runner.sensors.params import refuse_field
+from vram_arbiter.runner.params import wrong
 from vram_arbiter.runner.sensors.slot import FrameTee, SlotReader
 from vram_arbiter.schemas.config.robot import SensorBackend, SensorReaderConfig
 
@@ -30,7 +30,7 @@ def make_reader(config: SensorReaderConfig, clock: Clock) -> SlotReader:
     module = BACKENDS.get(config.backend)
     if module is None:
         known = ", ".join(BACKENDS)
-        raise refuse_field(config, "backend", f"{config.backend} is reserved; choose from {known}")
+        raise wrong("backend", f"{config.backend} is reserved; choose from {known}")
     tee: FrameTee | None = None
     if config.publish_to_ros:
         from vram_arbiter.runner.sensors.ros2_image import make_tee

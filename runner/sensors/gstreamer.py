@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from vram_arbiter.runner.control.clock import Clock
-from vram_arbiter.runner.sensors.params import read_params, refuse, refuse_field
+from vram_arbiter.runner.params import read_params, wrong
 from vram_arbiter.runner.sensors.pipelines import CAPS, SINK, GStreamerParams, build
 from vram_arbiter.runner.sensors.platform import probe_platform
 from vram_arbiter.runner.sensors.slot import (
@@ -111,13 +111,10 @@ def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> Slot
 
     Raises ConfigError: wrong parameters, GStreamer or an element missing, an invalid pipeline.
     """
-    params = read_params(config, GStreamerParams)
+    params = read_params(GStreamerParams, config.backend_params, "backend_params")
     if params.path is not None and not Path(params.path).is_file():
-        raise refuse(config, "path", f"there is no file {params.path}")
-    try:
-        libraries = load()
-    except ConfigError as error:
-        raise refuse_field(config, "backend", f"{error.message}; {error.hint}") from error
+        raise wrong("backend_params.path", f"there is no file {params.path}")
+    libraries = load()
     text = build(params, probe_platform())
     try:
         _parse(
@@ -125,7 +122,7 @@ def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> Slot
         )  # opens nothing; a typing error is said now, not when the robot is on
     except ValueError as error:
         field = "pipeline" if params.pipeline is not None else "source"
-        raise refuse(config, field, str(error)) from error
+        raise wrong(f"backend_params.{field}", str(error)) from error
     return GStreamerReader(config.sensor_id, config.max_age_ms, params, text, clock, tee)
 
 

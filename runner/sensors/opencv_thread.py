@@ -15,10 +15,11 @@ from urllib.parse import urlsplit, urlunsplit
 from pydantic import Field, model_validator
 
 from vram_arbiter.runner.control.clock import Clock
+from vram_arbiter.runner.params import Params, read_params, wrong
 from vram_arbiter.runner.sensors.lag import LagMeter
-from vram_arbiter.runner.sensors.params import BackendParams, read_params, refuse, require_module
 from vram_arbiter.runner.sensors.slot import BROKE_DOWN, Feed, FrameTee, SlotReader, ThreadReader
 from vram_arbiter.schemas.config.robot import SensorReaderConfig
+from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.world import FrameEncoding, SensorFrame
 
 FPS_MAX = 1000.0
@@ -29,7 +30,7 @@ Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
 Pixels = Annotated[int, Field(gt=0, le=16_384)]
 
 
-class OpenCvParams(BackendParams):
+class OpenCvParams(Params, strict=True):
     """`backend_params` of `opencv_thread`: one of `device`, `path` and `url`, and their options."""
 
     device: Annotated[int, Field(ge=0, le=255)] | None = None
@@ -105,10 +106,10 @@ def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> Slot
 
     Raises ConfigError: wrong parameters, missing file, missing OpenCV.
     """
-    params = read_params(config, OpenCvParams)
-    require_module(config, "cv2", "OpenCV", "runner")
+    params = read_params(OpenCvParams, config.backend_params, "backend_params")
+    need(config.backend, "cv2", extra="runner")
     if params.path is not None and not Path(params.path).is_file():
-        raise refuse(config, "path", f"there is no file {params.path}")
+        raise wrong("backend_params.path", f"there is no file {params.path}")
     return OpenCvReader(config.sensor_id, config.max_age_ms, params, clock, tee)
 
 

@@ -15,7 +15,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from vram_arbiter.runner.sensors.params import BackendParams
+from vram_arbiter.runner.params import Params
 from vram_arbiter.runner.sensors.platform import Platform
 
 SINK = "sink"
@@ -33,7 +33,7 @@ Value = Annotated[str, Field(min_length=1, max_length=1024, pattern=r"^[^\x00-\x
 Pixels = Annotated[int, Field(gt=0, le=16_384)]
 
 
-class GStreamerParams(BackendParams):
+class GStreamerParams(Params, strict=True):
     """`backend_params` of `gstreamer`: either `pipeline`, or `source` and what goes with it."""
 
     pipeline: Text | None = None

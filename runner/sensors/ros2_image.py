@@ -8,14 +8,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from vram_arbiter.runner.control.clock import Clock
+from vram_arbiter.runner.params import Params, read_params, wrong
 from vram_arbiter.runner.sensors.dds_thread import DdsThread
-from vram_arbiter.runner.sensors.params import (
-    BackendParams,
-    read_params,
-    refuse,
-    refuse_field,
-    require_module,
-)
 from vram_arbiter.runner.sensors.pictures import scaled_down
 from vram_arbiter.runner.sensors.ros2_dds import (
     DOMAIN_MAX,
@@ -37,6 +31,7 @@ from vram_arbiter.runner.sensors.ros2_types import RosMessage, cdr_of, read, sam
 from vram_arbiter.runner.sensors.slot import Feed, FrameTee, SlotReader
 from vram_arbiter.schemas.config.robot import SensorReaderConfig
 from vram_arbiter.schemas.errors import ConfigError
+from vram_arbiter.schemas.runtime.extras import need
 from vram_arbiter.schemas.world import SensorFrame
 
 log = logging.getLogger(__name__)
@@ -50,7 +45,7 @@ AHEAD_MAX_NS = (
 _RELIABILITY = 11  # DDS's number for the policy that two sides can disagree about
 
 
-class RosImageParams(BackendParams):
+class RosImageParams(Params, strict=True):
     """`backend_params` of `ros2_image`."""
 
     topic: Annotated[str, Field(min_length=1, max_length=256)]
@@ -70,24 +65,24 @@ class RosImageParams(BackendParams):
 
 def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> SlotReader:
     """Return a reader, not started. Raises ConfigError: wrong parameters, missing Cyclone DDS."""
-    params = read_params(config, RosImageParams)
-    require_module(config, "cyclonedds", "Cyclone DDS", "ros2")
+    params = read_params(RosImageParams, config.backend_params, "backend_params")
+    need("ROS 2", "cyclonedds", extra="ros2")
     try:
         topic = full_topic(params.topic)
     except ValueError as error:
-        raise refuse(config, "topic", str(error)) from error
+        raise wrong("backend_params.topic", str(error)) from error
     if config.publish_topic is not None and full_topic(config.publish_topic) == topic:
-        raise refuse_field(config, "publish_topic", f"the camera is read from {topic} itself")
+        raise wrong("publish_topic", f"the camera is read from {topic} itself")
     try:
         domain_id = domain_of() if params.domain_id is None else params.domain_id
     except ValueError as error:
-        raise refuse(config, "domain_id", str(error)) from error
+        raise wrong("backend_params.domain_id", str(error)) from error
     return RosImageReader(config.sensor_id, config.max_age_ms, params, domain_id, clock, tee)
 
 
 def make_tee(config: SensorReaderConfig) -> RosImagePublisher:
     """Return the publisher of a camera's frames on its `publish_topic`. Raises ConfigError."""
-    require_module(config, "cyclonedds", "Cyclone DDS", "ros2")
+    need("ROS 2", "cyclonedds", extra="ros2")
     try:
         return RosImagePublisher(
             config.publish_topic or "",
@@ -96,7 +91,7 @@ def make_tee(config: SensorReaderConfig) -> RosImagePublisher:
             width=config.publish_width,
         )
     except ValueError as error:
-        raise refuse_field(config, "publish_topic", str(error)) from error
+        raise wrong("publish_topic", str(error)) from error
 
 
 class RosImageReader(SlotReader):

@@ -13,7 +13,7 @@ def test_a_reserved_backend_is_refused_with_the_ones_there_are() -> None:
     config = SensorReaderConfig(sensor_id="front", backend=SensorBackend.HOLOSCAN)
     with pytest.raises(
         ConfigError,
-        match=r"sensor front: backend: holoscan is reserved; choose from .*opencv_thread",
+        match=r"backend: holoscan is reserved; choose from .*opencv_thread",
     ):
         make_reader(config, SystemClock())
 

@@ -392,7 +392,6 @@ def test_mistakes_are_named(params: dict[str, Any], problem: str) -> None:
     with pytest.raises(ConfigError) as caught:
         make(wrist(**params), CLOCK, None)
     assert problem in caught.value.message
-    assert caught.value.message.startswith("sensor wrist")
 
 
 def test_no_password_in_messages() -> None:
