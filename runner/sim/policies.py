@@ -78,10 +78,7 @@ def policy_of(name: str) -> MakeStep:
     where = name.removeprefix(SCRIPTED)
     if not name.startswith(SCRIPTED) or not where:
         raise ConfigError(f"unknown policy {name!r}", hint="random, expert or scripted:FILE")
-    make = _load(where).get("make")
-    if not callable(make):
-        raise ConfigError(f"{where} has no function `make(env, seed)`")
-    return cast("MakeStep", make)
+    return _scripted(where)
 
 
 def _expert(env: ArmEnvironment, seed: int) -> Step:
@@ -101,13 +98,16 @@ def _expert(env: ArmEnvironment, seed: int) -> Step:
     return act
 
 
-def _load(where: str) -> dict[str, object]:
-    """Return what a script defines."""
+def _scripted(where: str) -> MakeStep:
+    """Return the function `make` of a script."""
     if not Path(where).is_file():
         raise ConfigError(f"script not found: {where}")
     try:
-        return runpy.run_path(where, run_name=f"policy_{Path(where).stem}")
+        make = runpy.run_path(where, run_name=f"policy_{Path(where).stem}").get("make")
     except Exception as error:
         raise ConfigError(
             f"the policy {where} cannot be run: {type(error).__name__}: {error}"
         ) from error
+    if not callable(make):
+        raise ConfigError(f"{where} has no function `make(env, seed)`")
+    return cast("MakeStep", make)
