@@ -246,7 +246,7 @@ async def kill_daemon(bed: Bed) -> Found:
     """Measure the time from the daemon's SIGKILL until its successor knows the holder."""
     async with bed.holder("kept", bed.part_bytes):
         lease, used, began_s = await _held(bed), await bed.used(), time.monotonic()
-        await bed.restart_daemon()
+        await bed.programs.restart("arbiter", SIGKILL)
         if await _held(bed) != lease:
             raise Missed("the lease is another one")
         seconds = time.monotonic() - began_s
@@ -341,6 +341,7 @@ def _cube() -> bytes:
 @row("MiB", **TOLERANCE)
 async def left_as_found(bed: Bed) -> Found:
     """Measure the bytes that are used beside those of before, once all children have ended."""
+    await bed.programs.stop_all()
     with suppress(Missed):  # the figure says so
         await bed.returned(bed.found.used_bytes)
     now = await bed.read()
