@@ -31,7 +31,7 @@ class Consumer:
 
     `program`: words of a command, or a function at the top level of a file, with `arguments` and
     `named` that JSON can express. It finds the daemon and the simulated GPU by its environment, and
-    a function also finds what this process can import.
+    in this process's interpreter what this process can import.
     """
 
     def __init__(
@@ -39,8 +39,9 @@ class Consumer:
     ) -> None:
         environ = arbiter.environ | {FOLDER_VARIABLE: str(arbiter.gpu_folder)}
         if callable(program):
-            environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
             program = call.command(program, *arguments, **named)
+        if program[0] == sys.executable:
+            environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
         self.name = name
         self._arbiter = arbiter
         self._printed = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as the process

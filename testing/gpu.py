@@ -56,7 +56,8 @@ class FakeGpu:
     def stowaway(self, size: str | int | None = None) -> Iterator[int]:
         """Hold `size` bytes by a process without a lease; the block is given its pid. Without a
         size it takes all that are free, and others are out of memory. The process ends with the
-        block, or with this process."""
+        block, or with this process. As in `edited`, its event (`stowaway`) says that the daemon
+        knows."""
         with subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
             try:
                 held = self.free_bytes if size is None else size

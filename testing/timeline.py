@@ -45,9 +45,8 @@ class Timeline:
         except VramError as error:
             lines = [(0.0, f"no history: {error}")]
         for where, one in self._log_lines():
-            size, used = format_bytes(one["bytes"]), format_bytes(one["used_after"])
-            by = f"{one['name']} ({one['pid']})"
-            told = f"{where}  {one['op']} {size} by {by}, then {used} in use"
+            by, used = f"{one['name']} ({one['pid']})", format_bytes(one["used_after"])
+            told = f"{where}  {one['op']} {format_bytes(one['bytes'])} by {by}, then {used} in use"
             lines.append((one["t"] + wall_minus_monotonic_s, told))
         return "\n".join(line for _, line in sorted(lines, key=itemgetter(0)))
 
