@@ -18,7 +18,7 @@ from vram_arbiter.clients.calibration.model import observation_of
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.foreign.actions import Action
 from vram_arbiter.clients.foreign.cuda_checkpoint import CheckpointAction, CudaDriver
-from vram_arbiter.clients.foreign.program import is_below
+from vram_arbiter.clients.foreign.program import below, is_below
 from vram_arbiter.clients.selftest.bed import (
     MODEL_S,
     Bed,
@@ -31,7 +31,6 @@ from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import MIB, VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
 from vram_arbiter.schemas.errors import VramError, WaitTimeout
 from vram_arbiter.schemas.manifest import RSkillManifest
-from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 type Found = tuple[float, str]
@@ -270,8 +269,7 @@ async def _held(bed: Bed) -> str:
 async def fork_server(bed: Bed) -> Found:
     """Measure the processes of daemon and sidecars with a context, beside the model's."""
     async with bed.model(POLICY):
-        pids = [int(one.name) for one in procfs.PROC.iterdir() if one.name.isdecimal()]
-        tree = [pid for pid in pids if pid != os.getpid() and is_below(pid, os.getpid())]
+        tree = below(os.getpid())
         listed = (await bed.read()).processes or {}  # in a container: pids of the host
         holding = [pid for pid in tree if (pid in listed if bed.simulated else _opened_uvm(pid))]
     if not holding:
