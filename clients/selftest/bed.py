@@ -43,10 +43,10 @@ class Missed(Exception):
     """A row found something else than the product claims; the text says what."""
 
 
-def need(*packages: str, extra: str) -> None:
-    """Raises Skipped where one of the packages is not installed."""
+def need(*packages: str) -> None:
+    """Raises Skipped where one of these packages of the sidecars is not installed."""
     if not all(map(find_spec, packages)):
-        raise Skipped(f"install 'vram-arbiter[{extra}]'")
+        raise Skipped("install 'vram-arbiter[sidecars]'")
 
 
 async def answered_within[T](limit_s: float, work: Callable[[], T]) -> T:
@@ -131,7 +131,7 @@ class Bed:
         Raises Skipped, Missed, and SidecarUnavailable with the process's error.
         """
         if not self.simulated:
-            need("torch", extra="sidecars")
+            need("torch")
         used_bytes, command = await self.used(), [HOLDER, self.gpu.device]
         if lease:
             need_of = ("--vram", f"{self.lease_bytes}B", "--gpu", self.gpu.uuid, "--name", lease)
@@ -154,7 +154,7 @@ class Bed:
 
         Raises Skipped, Missed, SidecarUnavailable, and the sidecar's errors.
         """
-        need("torch", "transformers", "lerobot", extra="sidecars")
+        need("torch", "transformers", "lerobot")
         manifest = load_manifest(configs_folder(os.environ) / "rskills" / skill / "rskill.yaml")
         for name in sorted(set(self.skills) - set(self.programs.running)):
             await self.programs.start(

@@ -172,7 +172,7 @@ async def _rates(bed: Bed, *copies: str) -> list[float]:
 @row("", source="the CPU's answer", most=1e-3, hardware=True)
 async def nf4(bed: Bed) -> Found:
     """Measure the relative difference of NF4 on GPU and CPU."""
-    need("torch", "bitsandbytes", extra="sidecars")
+    need("torch", "bitsandbytes")
     async with bed.holder() as holder:
         told = await ask(holder, "nf4")
     if told["bytes"] * 8 != told["of_bytes"]:

@@ -101,7 +101,7 @@ def test_two_leases_of_all_that_can_be_leased_do_not_fit(bed: Bed) -> None:
 
 def test_what_a_row_needs_is_named() -> None:
     with pytest.raises(Skipped, match=r"install 'vram-arbiter\[sidecars\]'"):
-        need("json", "no_such_package", extra="sidecars")
+        need("json", "no_such_package")
 
 
 def test_a_driver_that_hangs_is_left_behind() -> None:
