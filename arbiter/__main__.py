@@ -189,6 +189,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     flags = parser().parse_args(argv)
     # the manager's watchdog kills by SIGABRT: the log then says where the daemon was stuck
     faulthandler.enable()
+    # the search for pydantic's plugins reads files of every installed distribution
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
         file = flags.config or config_of_service(os.environ)
         with without_collections():  # modules stay

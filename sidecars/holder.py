@@ -10,9 +10,9 @@ import os
 import signal
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, Final
 
 from vram_arbiter.schemas.defaults import MIB
@@ -85,38 +85,25 @@ class Holder:
         self._memory.touch()
         device, on_cpu = self._memory.torch_device, self._memory.torch_device == "cpu"
         restore = weights.own if on_cpu else lambda: network.to(device)
-        times = {"restore": self._seconds(restore)}
+        times = {"restore": _seconds(restore)}
         plain = torch.ones(weights.size_bytes, dtype=torch.uint8)
         there = plain.to(device, copy=True)  # the allocator has room from here on
         sources = {"pageable": plain} | ({} if on_cpu else {"page_locked": plain.pin_memory()})
         for name, source in sources.items():
             copy = partial(there.copy_, source)
-            times[name] = statistics.median(self._seconds(copy) for _ in range(REPEATS))
+            times[name] = statistics.median(_seconds(copy) for _ in range(REPEATS))
         return {name: weights.size_bytes / taken_s / 1e9 for name, taken_s in times.items()}
-
-    def _seconds(self, work: Callable[[], object]) -> float:
-        self._memory.empty_cache()  # waits for the GPU
-        began_s = time.perf_counter()
-        work()
-        if self._memory.torch_device != "cpu":
-            import torch
-
-            torch.cuda.synchronize()
-        return time.perf_counter() - began_s
 
     def nf4(self) -> JsonMap:
         """Quantize two linear layers in host RAM, and compare their answer there with that of the
         same bytes on the GPU. `difference` is relative."""
         import torch
 
-        from vram_arbiter.schemas.manifest import RSkillManifest
         from vram_arbiter.schemas.manifest.contracts import Quantization
         from vram_arbiter.sidecars.quantization import quantize_linear
 
-        # of a manifest, only this is read
         asked = Quantization.model_validate({"dtype": "int4", "extra": NF4})
-        fields: dict[str, Any] = {"name": "selftest", "quantization": asked}
-        manifest = RSkillManifest.model_construct(**fields)
+        manifest: Any = SimpleNamespace(name="selftest", quantization=asked)  # all that is read
         torch.manual_seed(0)
         layers = (torch.nn.Linear(WIDTH, WIDTH, bias=False) for _ in range(2))
         network = torch.nn.Sequential(*layers).eval().requires_grad_(False)
@@ -129,6 +116,15 @@ class Holder:
             there = network.to(device)(values.to(device)).cpu()
         difference = float((there - here).norm() / here.norm())
         return {"bytes": _size(network), "of_bytes": before, "difference": difference}
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    from torch.utils.benchmark.utils.timer import timer  # it waits for the GPU
+
+    began_s: float = timer()
+    work()
+    taken_s: float = timer() - began_s
+    return taken_s
 
 
 def _size(network: Any) -> int:

@@ -44,23 +44,17 @@ from vram_arbiter.schemas.yamltext import read_text
 NAME = "vram_arbiter.testing"
 
 
-def parser() -> argparse.ArgumentParser:
-    description, _, epilog = (__doc__ or "").partition("\n\n")
-    made = argparse.ArgumentParser(
-        prog=f"python -m {NAME}",
-        description=description,
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    made.add_argument("file", metavar="FILE", type=Path, help="YAML file")
-    add_version(made)
-    return made
-
-
 @terminal.program
 def main(argv: Sequence[str] | None = None) -> int:
     """Return the exit code."""
-    file = parser().parse_args(argv).file
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {NAME}",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("file", metavar="FILE", type=Path, help="YAML file")
+    add_version(parser)
+    file = parser.parse_args(argv).file
     from vram_arbiter.testing.scenario import load_scenario, play  # late: --help needs none of it
 
     try:

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from vram_arbiter.clients.cli.status import all_pages
+from vram_arbiter.clients.net.request import checked
 from vram_arbiter.schemas.codec import from_map
-from vram_arbiter.schemas.errors import from_wire
 from vram_arbiter.schemas.fakegpu import FOLDER_VARIABLE
 from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.views import LeaseView
@@ -31,7 +31,7 @@ class Consumer:
 
     `program`: words of a command, or a function at the top level of a file, with `arguments` and
     `named` that JSON can express. It finds the daemon and the simulated GPU by its environment, and
-    a function also finds what this process can import.
+    in this process's interpreter what this process can import.
     """
 
     def __init__(
@@ -39,8 +39,9 @@ class Consumer:
     ) -> None:
         environ = arbiter.environ | {FOLDER_VARIABLE: str(arbiter.gpu_folder)}
         if callable(program):
-            environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
             program = call.command(program, *arguments, **named)
+        if program[0] == sys.executable:
+            environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
         self.name = name
         self._arbiter = arbiter
         self._printed = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as the process
@@ -58,9 +59,7 @@ class Consumer:
     @property
     def lease(self) -> LeaseView | None:
         """Its newest lease, as `vramctl status` shows it. Raises ArbiterUnreachable."""
-        reply = all_pages(self._arbiter.endpoint)
-        if not reply.get("ok"):
-            raise from_wire(reply["error"])
+        reply = checked(all_pages(self._arbiter.endpoint))
         leases = [one for one in from_map(StatusReply, reply).leases if one.consumer == self.name]
         return leases[-1] if leases else None
 
@@ -98,10 +97,8 @@ class Consumer:
 
     def wait(self, timeout_s: float = WITHIN_S) -> int:
         """Close its standard input, and return its exit code. Raises subprocess.TimeoutExpired."""
-        assert self.process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):
-            self.process.stdin.close()
-        return self.process.wait(timeout_s)
+        self.process.communicate(timeout=timeout_s)
+        return self.process.returncode
 
     def close(self) -> None:
         """End the process, and those that it started, if they run."""

@@ -10,16 +10,17 @@ import socket
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Final, Self
 
-from vram_arbiter.testing.waiting import POLL_S, WITHIN_S, eventually
+from vram_arbiter.testing.waiting import WITHIN_S, eventually
 
 PROGRAM: Final = (sys.executable, "-m", "vram_arbiter.arbiter")
 FOREIGN: Final = ("VRAM_ARBITER_", "WATCHDOG_", "OTEL_")
 """Variables with which a program would find another daemon or collector."""
+KEEPS_BYTECODE: Final = {"PYTHONDONTWRITEBYTECODE": ""}
+"""Images of containers set it: the daemon would compile all that it imports at each start."""
 
 
 class ArbiterProcess:
@@ -44,7 +45,6 @@ class ArbiterProcess:
         if config is not None:
             (self.runtime / "arbiter.yaml").write_text(config)
             self.arguments += ["--config", str(self.runtime / "arbiter.yaml")]
-        (self.runtime / "arbiter.log").touch()
         self.process: subprocess.Popen[bytes] | None = None
         self.messages: list[str] = []
         self.program = list(PROGRAM)
@@ -67,15 +67,15 @@ class ArbiterProcess:
         return kept | {"VRAM_ARBITER_RUNTIME": str(self.runtime), "PYTHONUNBUFFERED": "1"}
 
     def command(self) -> list[str]:
-        given = ["--gpu", self.gpu, "--state-dir", str(self.state)]
-        return [*self.program, *given, *self.arguments]
+        where = ["--gpu", self.gpu, "--state-dir", str(self.state)]
+        return [*self.program, *where, *self.arguments]
 
     def spawn(self, extra_environ: Mapping[str, str] | None = None) -> subprocess.Popen[bytes]:
         """Start the daemon without waiting for it."""
         assert self.process is None or self.process.poll() is not None, "already running"
-        notify = {"NOTIFY_SOCKET": str(self.runtime / "notify.sock")}
+        own = KEEPS_BYTECODE | {"NOTIFY_SOCKET": str(self.runtime / "notify.sock")}
         with (self.runtime / "arbiter.log").open("ab") as log:
-            self.process = self._launch(self.environ | notify | dict(extra_environ or {}), log)
+            self.process = self._launch(self.environ | own | dict(extra_environ or {}), log)
         return self.process
 
     def _launch(self, environ: Mapping[str, str], log: IO[bytes]) -> subprocess.Popen[bytes]:
@@ -91,24 +91,26 @@ class ArbiterProcess:
         return process
 
     def start(self, extra_environ: Mapping[str, str] | None = None) -> Self:
-        """Start the daemon and wait until it says READY. Raises RuntimeError with its log if it
-        ends or stays silent."""
+        """Start the daemon and wait until it says READY, as `wait_for`."""
         self.spawn(extra_environ)
-        self.wait_for("READY=1", WITHIN_S)
+        self.wait_for("READY=1")
         return self
 
-    def wait_for(self, word: str, timeout_s: float) -> str:
-        """Wait for a notification that holds `word`. Raises RuntimeError."""
-        assert self.process is not None
-        deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
+    def wait_for(self, word: str, timeout_s: float = WITHIN_S) -> str:
+        """Wait for a notification that holds `word`. Raises RuntimeError if the daemon ends, and
+        AssertionError if it stays silent, with its log."""
+
+        def told() -> str:
+            assert self.process is not None
             ended = self.process.poll()  # first: what it said before its end is still read
-            if self._hear(POLL_S):
+            while self._hear():
                 if word in self.messages[-1]:
                     return self.messages[-1]
-            elif ended is not None:
+            if ended is not None:
                 raise RuntimeError(f"the arbiter ended with {ended}:\n{self.log}")
-        raise RuntimeError(f"no {word} from the arbiter within {timeout_s} s:\n{self.log}")
+            raise AssertionError(f"no {word} from the arbiter:\n{self.log}")
+
+        return eventually(told, timeout_s)
 
     def _hear(self, within_s: float = 0.0) -> bool:
         """Read one notification; False if there is none."""
@@ -125,8 +127,7 @@ class ArbiterProcess:
         assert self.process is not None
         while self._hear():  # the kernel keeps no more than ten, and drops the rest
             pass
-        if self.process.poll() is None:
-            self.process.send_signal(number)
+        self.process.send_signal(number)
         return self.process.wait(WITHIN_S)
 
     def close(self) -> None:

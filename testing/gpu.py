@@ -6,28 +6,17 @@ Knows nothing of leases. What a block turns on it turns off again at its end.
 import contextlib
 import json
 import os
-import re
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Final
 
+from vram_arbiter.clients.calibration.gpu import fake_gpu
 from vram_arbiter.schemas import fakegpu
-from vram_arbiter.schemas.errors import NoGpu
 from vram_arbiter.schemas.fakegpu import FOLDER_VARIABLE
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.runtime import fakegpu_folder, procfs
 from vram_arbiter.schemas.sizes import parse_bytes
-
-LAG: Final = re.compile(r"(\d+(?:\.\d+)?) ?(ms|s)")
-
-
-def parse_lag(text: object) -> float:
-    """Read `500ms` or `1.5s`. Raises ValueError, also for a number without a unit."""
-    if (found := LAG.fullmatch(str(text))) is None:
-        raise ValueError(f"expected a time such as 500ms or 1.5s, got {text!r}")
-    return float(found[1]) / (1000 if found[2] == "ms" else 1)
 
 
 class FakeGpu:
@@ -40,11 +29,7 @@ class FakeGpu:
     def __init__(self, folder: Path | None = None, name: str = "test") -> None:
         self.folder = folder or Path(os.environ.get(FOLDER_VARIABLE, f"${FOLDER_VARIABLE}"))
         self._name = name
-        if not (self.folder / fakegpu.GPU_FILE).exists():
-            raise NoGpu(
-                f"no simulated GPU in {self.folder}",
-                hint=f"start the arbiter with --gpu fake:8GiB, and set {FOLDER_VARIABLE}",
-            )
+        fake_gpu(self.folder)  # raises it
 
     @property
     def used_bytes(self) -> int:
@@ -71,7 +56,8 @@ class FakeGpu:
     def stowaway(self, size: str | int | None = None) -> Iterator[int]:
         """Hold `size` bytes by a process without a lease; the block is given its pid. Without a
         size it takes all that are free, and others are out of memory. The process ends with the
-        block, or with this process."""
+        block, or with this process. As in `edited`, its event (`stowaway`) says that the daemon
+        knows."""
         with subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
             try:
                 held = self.free_bytes if size is None else size

@@ -29,7 +29,7 @@ def gpu_budget(
     """Return the marker's arguments as bytes, seconds and text. Raises ValueError, and TypeError
     for others."""
     from vram_arbiter.schemas.sizes import parse_bytes
-    from vram_arbiter.testing.gpu import parse_lag
+    from vram_arbiter.testing.waiting import parse_lag
 
     return parse_bytes(size), parse_lag(lag), config
 
@@ -60,6 +60,12 @@ def _read(text: Callable[[], str]) -> str:
         return f"cannot be read: {error}"
 
 
+def _timeline(arbiter: "ArbiterProcess") -> "Timeline":
+    from vram_arbiter.testing.timeline import Timeline
+
+    return Timeline(arbiter)
+
+
 def _show(request: pytest.FixtureRequest, title: str, text: Callable[[], str]) -> None:
     request.node.stash.setdefault(_SHOWN, []).append((title, text))
 
@@ -76,11 +82,10 @@ def arbiter_process() -> Make:
 def make_arbiter(request: pytest.FixtureRequest, arbiter_process: Make) -> Iterator[Make]:
     """`make_arbiter(gpu="fake:8GiB", arguments=(), config=None)` prepares a daemon; call `.start()`
     on it. Ended at teardown."""
-    from vram_arbiter.testing.timeline import Timeline
 
     def make(*arguments: Any, **named: Any) -> "ArbiterProcess":
         daemon = ends.enter_context(closing(arbiter_process(*arguments, **named)))
-        _show(request, "timeline of the arbiter", Timeline(daemon).text)
+        _show(request, "timeline of the arbiter", lambda: _timeline(daemon).text())
         _show(request, "log of the arbiter", lambda: daemon.log)
         return daemon
 
@@ -91,14 +96,16 @@ def make_arbiter(request: pytest.FixtureRequest, arbiter_process: Make) -> Itera
 @pytest.fixture
 def arbiter(request: pytest.FixtureRequest, make_arbiter: Make) -> "ArbiterProcess":
     """A running daemon with the simulated GPU of marker `gpu_budget`."""
-    from vram_arbiter.testing.gpu import FakeGpu
-
     mark = request.node.get_closest_marker(MARKER)
     try:
         size, lag_s, config = gpu_budget(*mark.args, **mark.kwargs) if mark else gpu_budget()
     except (TypeError, ValueError) as error:
         pytest.fail(f"@pytest.mark.{MARKER}: {error}", pytrace=False)
-    daemon = make_arbiter(f"fake:{size}", config=config).start()
+    daemon = make_arbiter(f"fake:{size}", config=config)
+    daemon.spawn()
+    from vram_arbiter.testing.gpu import FakeGpu  # takes as long as the daemon's start
+
+    daemon.wait_for("READY=1")
     FakeGpu(daemon.gpu_folder).edit(release_lag_s=lag_s)
     return daemon
 
@@ -129,9 +136,7 @@ def consumer(request: pytest.FixtureRequest, arbiter: "ArbiterProcess") -> Itera
 @pytest.fixture
 def timeline(arbiter: "ArbiterProcess") -> "Timeline":
     """What happened: events, and assertions on them."""
-    from vram_arbiter.testing.timeline import Timeline
-
-    return Timeline(arbiter)
+    return _timeline(arbiter)
 
 
 @pytest.fixture(scope="session")

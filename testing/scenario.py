@@ -20,10 +20,10 @@ from vram_arbiter.schemas.units import ByteSize
 from vram_arbiter.schemas.yamltext import parse_yaml, validated
 from vram_arbiter.testing.consumer import Consumer
 from vram_arbiter.testing.daemon import ArbiterProcess
-from vram_arbiter.testing.gpu import FakeGpu, parse_lag
+from vram_arbiter.testing.gpu import FakeGpu
 from vram_arbiter.testing.stand_in import hold
 from vram_arbiter.testing.timeline import Timeline
-from vram_arbiter.testing.waiting import eventually
+from vram_arbiter.testing.waiting import eventually, parse_lag
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 Size = Annotated[ByteSize, Field(gt=0)]

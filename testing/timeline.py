@@ -14,7 +14,8 @@ from typing import Final
 
 from vram_arbiter.clients.cli.history import NEVER, Wanted, collect
 from vram_arbiter.clients.cli.text import event_line
-from vram_arbiter.schemas.errors import VramError, from_wire
+from vram_arbiter.clients.net.request import checked
+from vram_arbiter.schemas.errors import VramError
 from vram_arbiter.schemas.fakegpu import LOG_FILE
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.sizes import format_bytes
@@ -33,23 +34,19 @@ class Timeline:
     def events(self, *kinds: str, consumer: str | None = None) -> Sequence[JsonMap]:
         """Return the events of these kinds, by default all, in their order. Raises
         ArbiterUnreachable."""
-        reply = collect(Wanted(kinds, limit=NEVER, after=0), self._arbiter.endpoint)
-        if not reply.get("ok"):
-            raise from_wire(reply["error"])
+        reply = checked(collect(Wanted(kinds, limit=NEVER, after=0), self._arbiter.endpoint))
         return [one for one in reply["events"] if consumer in (None, one.get("consumer"))]
 
     def text(self) -> str:
         """Return history and allocation logs as lines, in the order of time."""
         wall_minus_monotonic_s = time.time() - time.monotonic()
-        lines: list[tuple[float, str]] = []
         try:
-            lines += [(float(one["at_wall_s"]), _line(one)) for one in self.events()]
+            lines = [(float(one["at_wall_s"]), _line(one)) for one in self.events()]
         except VramError as error:
-            lines.append((0.0, f"no history: {error}"))
+            lines = [(0.0, f"no history: {error}")]
         for where, one in self._log_lines():
-            size, used = format_bytes(one["bytes"]), format_bytes(one["used_after"])
-            by = f"{one['name']} ({one['pid']})"
-            told = f"{where}  {one['op']} {size} by {by}, then {used} in use"
+            by, used = f"{one['name']} ({one['pid']})", format_bytes(one["used_after"])
+            told = f"{where}  {one['op']} {format_bytes(one['bytes'])} by {by}, then {used} in use"
             lines.append((one["t"] + wall_minus_monotonic_s, told))
         return "\n".join(line for _, line in sorted(lines, key=itemgetter(0)))
 

@@ -26,9 +26,9 @@ from vram_arbiter.clients.cli import run as runs
 from vram_arbiter.clients.cli.replies import OK
 from vram_arbiter.clients.configs import configs_folder, shipped
 from vram_arbiter.clients.foreign.run_spec import RunSpec
-from vram_arbiter.clients.net.request import ask
+from vram_arbiter.clients.net.request import ask, checked
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS
-from vram_arbiter.schemas.errors import CalibrationFailed, ConfigError, from_wire
+from vram_arbiter.schemas.errors import CalibrationFailed, ConfigError
 from vram_arbiter.schemas.manifest import ManifestError, load_manifest
 from vram_arbiter.schemas.runtime.printable import printable
 from vram_arbiter.schemas.wire.requests import Status
@@ -151,10 +151,7 @@ def source_of(record: Record, requests: int, now: datetime) -> str:
 def _room(gpu: Gpu, endpoint: str | None) -> int:
     """Return the bytes that a lease alone on the GPU can have now. Raises ConfigError, and what the
     arbiter answers."""
-    reply = ask(Status(), endpoint)
-    if not reply.get("ok"):
-        raise from_wire(reply["error"])
-    for view in reply["gpus"]:
+    for view in checked(ask(Status(), endpoint))["gpus"]:
         if view["gpu"] == gpu.uuid:
             kept = sum(process["residue_bytes"] or 0 for process in view["processes"])
             taken = view["reserve_bytes"] + view["stowaway_bytes"] + kept

@@ -3,24 +3,18 @@ that take turns on it (`demo_stand_in`). Needs the base install only.
 """
 
 import asyncio
-import shutil
 import sys
-import tempfile
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from vram_arbiter.clients.cli.demo_display import Display
-from vram_arbiter.clients.cli.demo_programs import Programs
+from vram_arbiter.clients.cli.programs import private_arbiter
 from vram_arbiter.clients.cli.timeline import chart, collect
 from vram_arbiter.clients.cli.timeline.collect import Range
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.schemas import fakegpu
-from vram_arbiter.schemas.errors import ArbiterUnreachable
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE, RUNTIME_VARIABLE
+from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE
 
 STAND_INS: Final = {"detector": "5.3GB", "scene-vlm": "3.3GB", "grab": "4.3GB"}
 LIMIT_S: Final = 60.0
@@ -34,7 +28,7 @@ def run() -> int:
 
 async def _demo() -> int:
     print("starting the arbiter on a simulated GPU of 8 GiB, and three programs")
-    async with private_arbiter() as (programs, client):
+    async with private_arbiter("demo") as (programs, client):
         started = [
             await programs.start(name, "clients.cli.demo_stand_in", name, size)
             for name, size in STAND_INS.items()
@@ -48,33 +42,6 @@ async def _demo() -> int:
         kinds = {event["kind"] for event in events}
         draw(events, programs.environ[ENDPOINT_VARIABLE])
         return 0 if not failed and "oom" not in kinds and "verified" in kinds else 1
-
-
-@asynccontextmanager
-async def private_arbiter(*flags: str) -> AsyncIterator[tuple[Programs, AsyncClient]]:
-    """Start an arbiter of the demo's own on a simulated GPU of 8 GiB; programs that are started
-    beside it find it. All are ended at the end of the block.
-
-    Raises ArbiterUnreachable, SidecarUnavailable.
-    """
-    runtime = Path(tempfile.mkdtemp(prefix="vram-demo-"))  # short, for the paths of its sockets
-    endpoint = f"ipc://{runtime}/arbiter.sock"
-    environ = {
-        RUNTIME_VARIABLE: str(runtime),
-        ENDPOINT_VARIABLE: endpoint,  # not the machine's own arbiter
-        fakegpu.FOLDER_VARIABLE: str(runtime / "fakegpu"),
-    }
-    programs = Programs(runtime, environ)
-    try:
-        await programs.start("arbiter", "arbiter", "--gpu", "fake:8GiB", *flags)
-        async with AsyncClient("demo", endpoint=endpoint, connect_timeout_s=LIMIT_S) as client:
-            yield programs, client
-    except ArbiterUnreachable:
-        programs.check()  # says why it ended
-        raise
-    finally:
-        await programs.stop_all()
-        shutil.rmtree(runtime, ignore_errors=True)
 
 
 async def follow(client: AsyncClient, unfinished: Callable[[], bool]) -> list[JsonMap]:

@@ -4,19 +4,16 @@ import argparse
 import asyncio
 import json
 import logging
-import tempfile
 import time
 from pathlib import Path
 from typing import Final
 
-from vram_arbiter.clients.calibration.gpu import Gpu
 from vram_arbiter.clients.cli import arguments, files, terminal
-from vram_arbiter.clients.cli.doctor.machine import ask_nvml
 from vram_arbiter.clients.cli.replies import NO, OK
+from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.clients.selftest import report
-from vram_arbiter.clients.selftest.bed import READING_S, answered_within
 from vram_arbiter.clients.selftest.rows import LAST, ROWS
-from vram_arbiter.clients.selftest.run import judged, made, open_idle
+from vram_arbiter.clients.selftest.run import AUTO, FAKE, judged, made, opened
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.plain import JsonMap
@@ -30,8 +27,6 @@ DESCRIPTIONS = {
     "stop that, or name another GPU. Touches no process but its own children, and leaves the GPU "
     "as it was. Exits 0 if all rows that ran passed, 1 if one missed its limit or failed."
 }
-AUTO, FAKE = "auto", "fake"
-NO_DRIVER: Final = ("NVMLError_LibraryNotFound", "NVMLError_DriverNotLoaded")
 MEMORY_MIN_BYTES: Final = 768 * MIB
 """A context and the weights beside it."""
 
@@ -43,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
         help="number of a GPU, or a simulated one (default: the first GPU, else fake)",
     )  # fmt: skip
     add(
-        "--memory", type=_memory, default=GIB, metavar="SIZE",
+        "--memory", type=arguments.size, default=GIB, metavar="SIZE",
         help="most bytes on the GPU at a time (default: 1GiB)",
     )  # fmt: skip
     add(
@@ -52,8 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
     )  # fmt: skip
     names = [row.id for row in ROWS]
     add("--row", action="append", choices=names, help="this row alone; may be repeated")
-    add("--json", type=_file, metavar="FILE", help="write the results as JSON")
-    add("--report", type=_file, metavar="FILE", help="write them as Markdown, for an issue")
+    add("--json", type=Path, metavar="FILE", help="write the results as JSON")
+    add("--report", type=Path, metavar="FILE", help="write them as Markdown, for an issue")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -63,7 +58,12 @@ def run(args: argparse.Namespace) -> int:
 
 async def _run(args: argparse.Namespace) -> int:
     deadline_s, outcomes = time.monotonic() + args.within, list[JsonMap]()
-    gpu, why = await _opened(args.gpu, args.memory)
+    rows = [row for row in ROWS if args.row is None or row.id in args.row]
+    check_output("--json", args.json)
+    check_output("--report", args.report)
+    if args.memory < MEMORY_MIN_BYTES:
+        raise ConfigError(f"--memory: expected at least {format_bytes(MEMORY_MIN_BYTES)}")
+    gpu, why = await opened(args.gpu, args.memory)
     simulated = gpu is None
 
     def tell(outcome: JsonMap) -> None:
@@ -71,15 +71,13 @@ async def _run(args: argparse.Namespace) -> int:
         line = report.line_of(outcome, simulated=simulated)
         print("\n".join(terminal.folded(line, 4, terminal.columns())), flush=True)
 
-    rows = [row for row in ROWS if args.row is None or row.id in args.row]
-    with tempfile.TemporaryDirectory(prefix="vram-st", ignore_cleanup_errors=True) as folder:
-        async with made(folder, gpu, args.memory, {row.skill for row in rows} - {""}) as bed:
-            about = f"{bed.gpu.name}, {bed.gpu.driver}, at most {format_bytes(args.memory)} of it"
-            print(printable(about))
-            if simulated:
-                print(printable(f"{report.SIMULATED} ({why})"), flush=True)
-            for row in rows:
-                tell(await judged(row, bed, deadline_s - time.monotonic()))
+    async with made(gpu, args.memory, {row.skill for row in rows} - {""}) as bed:
+        about = f"{bed.gpu.name}, {bed.gpu.driver}, at most {format_bytes(args.memory)} of it"
+        print(printable(about))
+        if simulated:
+            print(printable(f"{report.SIMULATED} ({why})"), flush=True)
+        for row in rows:
+            tell(await judged(row, bed, deadline_s - time.monotonic()))
         tell(await judged(LAST, bed, LAST.limit_s))
     told = report.told(bed.gpu, outcomes, simulated=simulated)
     print(told["summary"])
@@ -90,39 +88,7 @@ async def _run(args: argparse.Namespace) -> int:
     return OK if all(one["verdict"] in ("pass", "skipped") for one in outcomes) else NO
 
 
-async def _opened(wanted: str, memory_bytes: int) -> tuple[Gpu | None, str]:
-    """Open the GPU that is asked for; None: a simulated one, and why. Raises ConfigError for a GPU
-    without memory of its own, ProbeFailed where the driver hangs, and what `open_idle` raises."""
-    if wanted == FAKE:
-        return None, "--gpu fake"
-    nvml = await answered_within(READING_S, ask_nvml)
-    if wanted == AUTO and nvml.error in NO_DRIVER:
-        return None, nvml.problem
-    if nvml.without_memory:
-        raise ConfigError(
-            "this GPU uses the machine's memory, of which no row can tell its own part",
-            hint="vramctl selftest --gpu fake; vramctl doctor examines the machine",
-        )
-    return await open_idle(0 if wanted == AUTO else int(wanted), memory_bytes), ""
-
-
 def _gpu(written: str) -> str:
     if written not in (AUTO, FAKE) and not written.isdecimal():
         raise argparse.ArgumentTypeError(f"expected auto, fake or a number, got {written!r}")
     return written
-
-
-def _memory(written: str) -> int:
-    size = arguments.size(written)
-    if size < MEMORY_MIN_BYTES:
-        raise argparse.ArgumentTypeError(
-            f"expected at least {format_bytes(MEMORY_MIN_BYTES)}: a context and weights beside it"
-        )
-    return size
-
-
-def _file(written: str) -> Path:
-    place = Path(written)
-    if not place.parent.is_dir():
-        raise argparse.ArgumentTypeError(f"not a folder: {place.parent}")
-    return place

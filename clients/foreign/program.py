@@ -10,7 +10,7 @@ import contextlib
 import ctypes
 import os
 import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final, Protocol, Self
 
 from vram_arbiter.schemas.runtime import procfs
@@ -157,11 +157,7 @@ class ForeignProgram:
 
     def tree(self) -> list[int]:
         """Return the pids of the program's living processes, parents first."""
-        children = _children()
-        found = [pid for pid in children.get(os.getpid(), ()) if pid not in self._others]
-        for pid in found:
-            found += children.get(pid, ())
-        return found
+        return below(os.getpid(), self._others)
 
     def reap(self) -> None:
         """Take the exit status of adopted processes that ended. Needs `adopt_orphans`."""
@@ -185,6 +181,16 @@ def _children() -> dict[int, list[int]]:
             stat = procfs.read_stat(int(entry.name))
             if stat is not None and stat.alive:
                 found.setdefault(stat.parent_pid, []).append(int(entry.name))
+    return found
+
+
+def below(ancestor: int, others: Collection[int] = ()) -> list[int]:
+    """Return the living processes that descend from one, parents first, but for some of its
+    children and what is below them."""
+    children = _children()
+    found = [pid for pid in children.get(ancestor, ()) if pid not in others]
+    for pid in found:
+        found += children.get(pid, ())
     return found
 
 

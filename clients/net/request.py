@@ -10,7 +10,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from vram_arbiter.schemas.codec import to_map
-from vram_arbiter.schemas.errors import ArbiterUnreachable
+from vram_arbiter.schemas.errors import ArbiterUnreachable, from_wire
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.runtime.endpoints import arbiter_endpoint
 from vram_arbiter.schemas.runtime.msgpack_codec import pack
@@ -58,6 +58,13 @@ def ask(
         for number, asked in enumerate((hello, request), 1):
             link.send(pack({**to_map(asked), "id": number}))
         return _reply(link, where, deadline, silent)
+
+
+def checked(reply: Message) -> Message:
+    """Return a reply that is no refusal. Raises the error of one that is."""
+    if not reply.get("ok"):
+        raise from_wire(reply["error"])
+    return reply
 
 
 def _link(

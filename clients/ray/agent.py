@@ -9,10 +9,9 @@ from collections.abc import Iterable
 from typing import Any, Final
 
 from vram_arbiter.clients.cli.status import all_pages
-from vram_arbiter.clients.net.request import ask
+from vram_arbiter.clients.net.request import ask, checked
 from vram_arbiter.clients.ray.placement import View, view_of
 from vram_arbiter.schemas.codec import from_map
-from vram_arbiter.schemas.errors import from_wire
 from vram_arbiter.schemas.plain import Message
 from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.requests import AskWhy
@@ -31,11 +30,11 @@ class Agent:
 
     def view(self) -> View:
         """Raises ArbiterUnreachable, and what else the arbiter refuses."""
-        return view_of(from_map(StatusReply, _checked(all_pages(None))), self._box)
+        return view_of(from_map(StatusReply, checked(all_pages(None))), self._box)
 
     def why(self, consumer: str) -> Message:
         """What keeps a consumer from running there, as `vramctl why --json` says it."""
-        return _checked(ask(AskWhy(consumer)))
+        return checked(ask(AskWhy(consumer)))
 
 
 def running(nodes: Iterable[str]) -> bool:
@@ -67,9 +66,3 @@ def start(node: str, box: str) -> Any:
 
 def _name(node: str) -> str:
     return f"agent-{node}"
-
-
-def _checked(reply: Message) -> Message:
-    if not reply.get("ok"):
-        raise from_wire(reply["error"])
-    return reply

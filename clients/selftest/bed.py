@@ -12,15 +12,14 @@ from collections.abc import AsyncIterator, Callable, Collection
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from signal import SIGKILL
 from typing import Any, Final
 
 from vram_arbiter.clients.calibration.gpu import Gpu, Reading
-from vram_arbiter.clients.cli.demo_programs import DemoProgram, Programs
+from vram_arbiter.clients.cli.programs import Program, Programs
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.sidecar.build import CLIENTS
-from vram_arbiter.schemas.defaults import VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
+from vram_arbiter.schemas.defaults import RESERVE_BYTES, VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
 from vram_arbiter.schemas.errors import ProbeFailed, SidecarUnavailable
 from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
 from vram_arbiter.schemas.plain import JsonMap
@@ -44,10 +43,10 @@ class Missed(Exception):
     """A row found something else than the product claims; the text says what."""
 
 
-def need(*packages: str, extra: str) -> None:
-    """Raises Skipped where one of the packages is not installed."""
+def need(*packages: str) -> None:
+    """Raises Skipped where one of these packages of the sidecars is not installed."""
     if not all(map(find_spec, packages)):
-        raise Skipped(f"install 'vram-arbiter[{extra}]'")
+        raise Skipped("install 'vram-arbiter[sidecars]'")
 
 
 async def answered_within[T](limit_s: float, work: Callable[[], T]) -> T:
@@ -60,7 +59,7 @@ async def answered_within[T](limit_s: float, work: Callable[[], T]) -> T:
         raise ProbeFailed(late, hint="see nvidia-smi and dmesg") from None
 
 
-async def ask(holder: DemoProgram, word: str, *sizes: int) -> JsonMap:
+async def ask(holder: Program, word: str, *sizes: int) -> JsonMap:
     """Return the answer of a holder to a request of `sidecars.holder`. Raises SidecarUnavailable
     where it has failed."""
     asked, answers = holder.process.stdin, holder.process.stdout
@@ -76,16 +75,13 @@ async def ask(holder: DemoProgram, word: str, *sizes: int) -> JsonMap:
 
 @dataclass(slots=True)
 class Bed:
-    """Where rows are measured. `memory_bytes` is the most that is on the GPU at a time;
-    `lease_bytes` are all that the daemon has, so that one lease excludes another."""
+    """Where rows are measured. `memory_bytes` is the most that is on the GPU at a time."""
 
     gpu: Gpu
     found: Reading  # before all others
     memory_bytes: int
-    lease_bytes: int
     programs: Programs
     client: AsyncClient
-    daemon: tuple[str, ...]  # its arguments
     skills: Collection[str]  # whose sidecars are needed
     patience_s: float = VERIFY_TIMEOUT_S  # of memory that is on its way back
     copies: JsonMap = field(default_factory=dict)
@@ -98,6 +94,13 @@ class Bed:
     def part_bytes(self) -> int:
         """Bytes of a holder beside its context."""
         return self.memory_bytes // 4
+
+    @property
+    def lease_bytes(self) -> int:
+        """All that can be leased, less what the driver may take meanwhile: two leases of so many
+        never fit."""
+        left = self.gpu.total_bytes - self.found.used_bytes
+        return left - RESERVE_BYTES - 2 * VERIFY_TOLERANCE_BYTES
 
     async def read(self) -> Reading:
         """Raises ProbeFailed."""
@@ -117,15 +120,10 @@ class Bed:
             await asyncio.sleep(POLL_S)
         return time.monotonic() - began_s
 
-    async def restart_daemon(self) -> None:
-        """Kill the daemon, and start it again on the same files."""
-        await self.programs.stop("arbiter", SIGKILL)
-        await self.programs.start("arbiter", "arbiter", *self.daemon)
-
     @asynccontextmanager
     async def holder(
         self, lease: str = "", size_bytes: int | None = None, **environ: str
-    ) -> AsyncIterator[DemoProgram]:
+    ) -> AsyncIterator[Program]:
         """Start a process that holds a context and so many bytes (None: neither), and end it again:
         under a lease of that name (`vramctl run`), or without one, which makes it a stowaway. Its
         bytes are back at the end of the block.
@@ -133,7 +131,7 @@ class Bed:
         Raises Skipped, Missed, and SidecarUnavailable with the process's error.
         """
         if not self.simulated:
-            need("torch", extra="sidecars")
+            need("torch")
         used_bytes, command = await self.used(), [HOLDER, self.gpu.device]
         if lease:
             need_of = ("--vram", f"{self.lease_bytes}B", "--gpu", self.gpu.uuid, "--name", lease)
@@ -156,7 +154,7 @@ class Bed:
 
         Raises Skipped, Missed, SidecarUnavailable, and the sidecar's errors.
         """
-        need("torch", "transformers", "lerobot", extra="sidecars")
+        need("torch", "transformers", "lerobot")
         manifest = load_manifest(configs_folder(os.environ) / "rskills" / skill / "rskill.yaml")
         for name in sorted(set(self.skills) - set(self.programs.running)):
             await self.programs.start(

@@ -18,7 +18,7 @@ from vram_arbiter.clients.calibration.model import observation_of
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.foreign.actions import Action
 from vram_arbiter.clients.foreign.cuda_checkpoint import CheckpointAction, CudaDriver
-from vram_arbiter.clients.foreign.program import is_below
+from vram_arbiter.clients.foreign.program import below, is_below
 from vram_arbiter.clients.selftest.bed import (
     MODEL_S,
     Bed,
@@ -31,7 +31,6 @@ from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import MIB, VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
 from vram_arbiter.schemas.errors import VramError, WaitTimeout
 from vram_arbiter.schemas.manifest import RSkillManifest
-from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 type Found = tuple[float, str]
@@ -173,7 +172,7 @@ async def _rates(bed: Bed, *copies: str) -> list[float]:
 @row("", source="the CPU's answer", most=1e-3, hardware=True)
 async def nf4(bed: Bed) -> Found:
     """Measure the relative difference of NF4 on GPU and CPU."""
-    need("torch", "bitsandbytes", extra="sidecars")
+    need("torch", "bitsandbytes")
     async with bed.holder() as holder:
         told = await ask(holder, "nf4")
     if told["bytes"] * 8 != told["of_bytes"]:
@@ -246,7 +245,7 @@ async def kill_daemon(bed: Bed) -> Found:
     """Measure the time from the daemon's SIGKILL until its successor knows the holder."""
     async with bed.holder("kept", bed.part_bytes):
         lease, used, began_s = await _held(bed), await bed.used(), time.monotonic()
-        await bed.restart_daemon()
+        await bed.programs.restart("arbiter", SIGKILL)
         if await _held(bed) != lease:
             raise Missed("the lease is another one")
         seconds = time.monotonic() - began_s
@@ -270,8 +269,7 @@ async def _held(bed: Bed) -> str:
 async def fork_server(bed: Bed) -> Found:
     """Measure the processes of daemon and sidecars with a context, beside the model's."""
     async with bed.model(POLICY):
-        pids = [int(one.name) for one in procfs.PROC.iterdir() if one.name.isdecimal()]
-        tree = [pid for pid in pids if pid != os.getpid() and is_below(pid, os.getpid())]
+        tree = below(os.getpid())
         listed = (await bed.read()).processes or {}  # in a container: pids of the host
         holding = [pid for pid in tree if (pid in listed if bed.simulated else _opened_uvm(pid))]
     if not holding:
@@ -341,6 +339,7 @@ def _cube() -> bytes:
 @row("MiB", **TOLERANCE)
 async def left_as_found(bed: Bed) -> Found:
     """Measure the bytes that are used beside those of before, once all children have ended."""
+    await bed.programs.stop_all()
     with suppress(Missed):  # the figure says so
         await bed.returned(bed.found.used_bytes)
     now = await bed.read()

@@ -5,37 +5,45 @@ import os
 import time
 from collections.abc import AsyncIterator, Collection, Mapping
 from contextlib import asynccontextmanager, suppress
-from pathlib import Path
 from typing import Final, Literal
 
 from vram_arbiter.clients.calibration.gpu import Gpu, open_gpu
-from vram_arbiter.clients.cli.demo_programs import Programs
-from vram_arbiter.clients.cli.doctor.machine import ask_arbiter
-from vram_arbiter.clients.client import AsyncClient
+from vram_arbiter.clients.cli.doctor.machine import ask_arbiter, ask_nvml
+from vram_arbiter.clients.cli.programs import private_arbiter
 from vram_arbiter.clients.net.link import is_listening
 from vram_arbiter.clients.selftest.bed import READING_S, Bed, Missed, Skipped, answered_within
-from vram_arbiter.clients.selftest.rows import BEAT_S, Claim
-from vram_arbiter.schemas.defaults import RESERVE_BYTES, VERIFY_TOLERANCE_BYTES
-from vram_arbiter.schemas.errors import (
-    ArbiterUnreachable,
-    CheckpointUnsupported,
-    ConfigError,
-    SidecarUnavailable,
-)
+from vram_arbiter.clients.selftest.rows import Claim
+from vram_arbiter.schemas.defaults import RESERVE_BYTES
+from vram_arbiter.schemas.errors import CheckpointUnsupported, ConfigError
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime import endpoints
 from vram_arbiter.schemas.sizes import format_bytes
 
 type Verdict = Literal["pass", "miss", "failed", "skipped"]
 
-START_S: Final = 30.0
 SIMULATED: Final = "fake:8GiB"
+AUTO, FAKE = "auto", "fake"
+NO_DRIVER: Final = ("NVMLError_LibraryNotFound", "NVMLError_DriverNotLoaded")
 
 
-async def open_idle(index: int, memory_bytes: int) -> Gpu:
-    """Open the GPU of this number. Raises ConfigError where it is leased or has no room, NoGpu,
-    ProbeFailed."""
-    gpu = await answered_within(READING_S, lambda: open_gpu(f"cuda:{index}"))
+async def opened(wanted: str, memory_bytes: int) -> tuple[Gpu | None, str]:
+    """Open the GPU of this number, the first for AUTO; None: a simulated one, and why.
+
+    Raises ConfigError where it is leased, or has no room or no memory of its own, NoGpu, and
+    ProbeFailed.
+    """
+    if wanted == FAKE:
+        return None, "--gpu fake"
+    nvml = await answered_within(READING_S, ask_nvml)
+    if wanted == AUTO and nvml.error in NO_DRIVER:
+        return None, nvml.problem
+    if nvml.without_memory:
+        raise ConfigError(
+            "this GPU uses the machine's memory, of which no row can tell its own part",
+            hint="vramctl selftest --gpu fake; vramctl doctor examines the machine",
+        )
+    device = f"cuda:{0 if wanted == AUTO else wanted}"
+    gpu = await answered_within(READING_S, lambda: open_gpu(device))
     if (endpoint := leased_at(gpu.uuid)) is not None:
         raise ConfigError(
             f"the arbiter at {endpoint} leases {gpu.name} ({gpu.uuid}), or does not say",
@@ -48,7 +56,7 @@ async def open_idle(index: int, memory_bytes: int) -> Gpu:
             f"beside the reserve of {format_bytes(RESERVE_BYTES)} are needed",
             hint="end a program that uses it (nvidia-smi lists them), or choose a smaller --memory",
         )
-    return gpu
+    return gpu, ""
 
 
 def leased_at(uuid: str, environ: Mapping[str, str] = os.environ) -> str | None:
@@ -65,45 +73,15 @@ def leased_at(uuid: str, environ: Mapping[str, str] = os.environ) -> str | None:
 
 
 @asynccontextmanager
-async def made(
-    folder: str, gpu: Gpu | None, memory_bytes: int, skills: Collection[str]
-) -> AsyncIterator[Bed]:
-    """Start a daemon in a folder, short for the paths of sockets, on a GPU (None: a simulated one),
-    and end it and all other children with the block.
-
-    Raises ConfigError and ProbeFailed, and SidecarUnavailable where the daemon does not start.
-    """
-    endpoint = f"ipc://{folder}/arbiter.sock"
-    environ = {endpoints.RUNTIME_VARIABLE: folder, endpoints.ENDPOINT_VARIABLE: endpoint}
-    programs = Programs(Path(folder), environ | {"TMPDIR": folder})
-    daemon = ("--gpu", "nvml" if gpu else SIMULATED, "--state-dir", f"{folder}/state")
-    try:
-        await programs.start("arbiter", "arbiter", *daemon)
-        async with AsyncClient("selftest", endpoint=endpoint, connect_timeout_s=START_S) as client:
-            gpu = gpu or open_gpu(f"fake:{folder}/fakegpu")
-            programs.environ = {**programs.environ, **gpu.environ}
-            found = await answered_within(READING_S, gpu.read)
-            async with asyncio.timeout(START_S):
-                room = await room_on(client, gpu.uuid)
-            yield Bed(gpu, found, memory_bytes, room, programs, client, daemon, skills)
-    except (ArbiterUnreachable, TimeoutError) as error:
-        programs.check()  # says why it ended
-        raise SidecarUnavailable(
-            "the daemon does not read the GPU", hint="vramctl doctor"
-        ) from error
-    finally:
-        await programs.stop_all()
-
-
-async def room_on(client: AsyncClient, gpu: str) -> int:
-    """Return the bytes that the daemon can lease now, less what the driver may take meanwhile: two
-    leases of so many never fit."""
-    while True:
-        (view,) = [one for one in (await client.status()).gpus if one.gpu == gpu]
-        if view.measured_used_bytes is not None:
-            left = view.capacity_bytes - view.reserve_bytes - view.stowaway_bytes
-            return left - 2 * VERIFY_TOLERANCE_BYTES
-        await asyncio.sleep(BEAT_S)
+async def made(gpu: Gpu | None, memory_bytes: int, skills: Collection[str]) -> AsyncIterator[Bed]:
+    """Start a daemon on a GPU (None: a simulated one); end it and all other children with the
+    block. Raises NoGpu, ProbeFailed, and what `private_arbiter` raises."""
+    source = "nvml" if gpu else SIMULATED
+    async with private_arbiter("selftest", source) as (programs, client):
+        gpu = gpu or open_gpu(f"fake:{programs.log_dir}/fakegpu")
+        programs.environ |= gpu.environ
+        found = await answered_within(READING_S, gpu.read)
+        yield Bed(gpu, found, memory_bytes, programs, client, skills)
 
 
 async def judged(row: Claim, bed: Bed, left_s: float) -> JsonMap:

@@ -9,7 +9,7 @@ from vram_arbiter.schemas.plain import JsonMap
 @dataclass_transform(frozen_default=True)
 class Refusal:
     """Base of the values of one kind of refusal, as the engine makes them: typed fields and no
-    words. A subclass is a frozen dataclass.
+    words. A subclass is a dataclass, frozen for the type checker (as `Tagged`).
 
     `code` is the wire code. `arbiter.rpc.words` makes an `ErrorView` of it, with the fields as
     `details`.
@@ -20,7 +20,7 @@ class Refusal:
     def __init_subclass__(cls, *, code: str = "") -> None:
         if code:
             cls.code = code
-        dataclass(frozen=True)(cls)
+        dataclass()(cls)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, *_: object) -> dict[str, str]:

@@ -6,8 +6,12 @@ from typing import ClassVar, dataclass_transform
 
 @dataclass_transform(frozen_default=True)
 class Tagged:
-    """Base of requests, replies, pushes and notes, which are frozen dataclasses: the map of
-    `class GrantedNote(Tagged, kind="granted")` has that key (`schemas.codec`)."""
+    """Base of requests, replies, pushes and notes, which are dataclasses: the map of
+    `class GrantedNote(Tagged, kind="granted")` has that key (`schemas.codec`).
+
+    They are frozen for the type checker alone: to make and to use the methods that freeze them
+    would be a twelfth of the daemon's start, and half of the time that makes a note.
+    """
 
     TAG: ClassVar[tuple[str, str]]
 
@@ -15,7 +19,7 @@ class Tagged:
         super().__init_subclass__()
         for pair in tag.items():
             cls.TAG = pair
-        dataclass(frozen=True, kw_only=kw_only)(cls)
+        dataclass(kw_only=kw_only)(cls)
 
 
 class AnyReply(Tagged):

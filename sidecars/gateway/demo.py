@@ -16,8 +16,8 @@ from typing import Final
 import aiohttp
 import yaml
 
-from vram_arbiter.clients.cli.demo_programs import Programs
-from vram_arbiter.clients.cli.demo_quick import draw, follow, private_arbiter
+from vram_arbiter.clients.cli.demo_quick import draw, follow
+from vram_arbiter.clients.cli.programs import Programs, private_arbiter
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE
 
@@ -50,7 +50,7 @@ def run(*, browser: bool) -> int:
 async def _demo(*, browser: bool) -> int:
     page = PAGE if importlib.util.find_spec("starlette") is not None else ()
     print("starting an arbiter on a simulated GPU of 8 GiB, and the gateway", flush=True)
-    async with private_arbiter(*page) as (programs, client):
+    async with private_arbiter("demo", "fake:8GiB", *page) as (programs, client):
         config = programs.log_dir / "gateway.yaml"
         config.write_text(yaml.safe_dump(_config()))
         await programs.start("gateway", "sidecars.gateway", "serve", "--config", str(config))

@@ -1,18 +1,23 @@
-"""What the arbiter costs while nothing happens, and how fast `vramctl status` starts."""
+"""What the arbiter costs while nothing happens, and how fast it and `vramctl status` start."""
 
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 from tests.bench.harness import SHIPPED, Peer, Suite, arbiter, elapsed_us, environ, in_turns, pause
 from tests.support.processes import rss_bytes
+from vram_arbiter.testing.daemon import ArbiterProcess
 
 QUIET_AFTER_S = 11.0
 """The GPU is read in the background until 10 s after the last client."""
 STATUS = (
     "import sys; sys.argv[1:] = ['status']; from vram_arbiter.clients.cli.main import main; main()"
 )
+
+LIBRARIES = "import asyncio, ctypes, msgpack, pydantic, sqlite3; pydantic.BaseModel"
+"""What each daemon imports that is not ours."""
 
 
 def run(suite: Suite) -> None:
@@ -41,10 +46,24 @@ def run(suite: Suite) -> None:
         calls = {"bare": lambda: start("pass"), "status": lambda: start(STATUS)}
         found = in_turns(suite.size(60, 5), calls, chunk=5)
         peer.close()
+        calls = {"libraries": lambda: start(LIBRARIES), "daemon": until_ready}
+        found |= in_turns(suite.size(20, 5), calls, chunk=5)
     suite.time("bare Python's start", found["bare"])
     suite.compare(
         "start of vramctl status, answered", found["status"], found["bare"], "bare Python", 8.0
     )
+    suite.compare(
+        "start of a daemon, ready", found["daemon"], found["libraries"], "its libraries", 3.0
+    )
+    suite.limit(
+        "fixture arbiter of a test", found["daemon"], p50_max_us=500_000.0, p99_max_us=1_000_000.0
+    )
+
+
+def until_ready() -> float:
+    """Start a daemon as `vram_arbiter.testing` does; return the microseconds until READY."""
+    with closing(ArbiterProcess(config=SHIPPED)) as daemon:
+        return elapsed_us(daemon.start)
 
 
 def busy_percent(pid: int, seconds: float) -> float:

@@ -22,7 +22,7 @@ from typing import TypedDict
 
 from tests.support.paths import ROOT
 from vram_arbiter.clients.cli.demo import BUDGET, LOOP_S, Episode, boot, make_gpu
-from vram_arbiter.clients.cli.demo_programs import Programs
+from vram_arbiter.clients.cli.programs import Programs
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.runtime.endpoints import RUNTIME_VARIABLE
 from vram_arbiter.schemas.units import parse_bytes

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import IO
 
 from tests.support.prepared import Forked, start
-from vram_arbiter.clients.cli import demo_programs
+from vram_arbiter.clients.cli import programs
 from vram_arbiter.clients.cli.main import main
 
 PROGRAMS = {
@@ -42,7 +42,7 @@ async def _start_fork(
     return _Process(await asyncio.to_thread(start, PROGRAMS[module], arguments, env, sink, sink))
 
 
-vars(demo_programs)["asyncio"] = SimpleNamespace(
+vars(programs)["asyncio"] = SimpleNamespace(
     create_subprocess_exec=_start_fork, subprocess=asyncio.subprocess, wait_for=asyncio.wait_for
 )
 

@@ -11,7 +11,8 @@ from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_gpu
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed
 from vram_arbiter.schemas.fakegpu import FOLDER_VARIABLE, SimulatedOutOfMemory
-from vram_arbiter.testing.gpu import FakeGpu, parse_lag
+from vram_arbiter.testing.gpu import FakeGpu
+from vram_arbiter.testing.waiting import parse_lag
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ prove the opposite."""
 import signal
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -84,6 +85,17 @@ def test_a_consumer_that_ends_early_shows_its_output(consumer: Start) -> None:
 def test_only_what_can_be_called_elsewhere_is_a_consumer(consumer: Start) -> None:
     with pytest.raises(TypeError, match=r"at the top level of a file, got .*<lambda>"):
         consumer("odd", lambda: None)
+
+
+def test_a_program_finds_what_the_test_can_import(
+    consumer: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: a project that is not installed is on the path of its tests alone (`pythonpath`
+    in their configuration), and `python -m` of its own module ended at once."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "not_installed.py").write_text("print('found')")
+    program = consumer("program", [sys.executable, "-m", "not_installed"])
+    assert (program.wait(), program.output) == (0, "found\n")
 
 
 def test_what_a_consumer_started_ends_with_it(consumer: Start) -> None:

@@ -18,9 +18,10 @@ from vram_arbiter.clients.cli.offline import EVENT_LOG
 from vram_arbiter.clients.cli.status import all_pages
 from vram_arbiter.clients.cli.timeline.reader import Reader
 from vram_arbiter.clients.cli.timeline.story import Story
+from vram_arbiter.clients.net.request import checked
 from vram_arbiter.schemas.codec import from_map
 from vram_arbiter.schemas.defaults import RESERVE_BYTES
-from vram_arbiter.schemas.errors import OperatorError, from_wire
+from vram_arbiter.schemas.errors import OperatorError
 from vram_arbiter.schemas.plain import JsonMap, Message
 from vram_arbiter.schemas.wire.replies import StatusReply
 from vram_arbiter.schemas.wire.views import LeaseView
@@ -65,10 +66,10 @@ def from_history(wanted: Range, endpoint: str | None) -> Story:
     """Read the history of a running daemon. Raises EmptyTimeline, ArbiterUnreachable, and what the
     arbiter refuses."""
     begin = wanted.begin_s(time.time(), 0.0)
-    last_seq = int(_checked(history.page(NEVER, 1, (), endpoint))["last_seq"])
+    last_seq = int(_readable(history.page(NEVER, 1, (), endpoint))["last_seq"])
     start = history.first_since(begin, last_seq, endpoint)
     events = [one for one in _events(start, NEVER, (), endpoint) if one["at_wall_s"] >= begin]
-    status = from_map(StatusReply, _checked(all_pages(endpoint)))
+    status = from_map(StatusReply, checked(all_pages(endpoint)))
     end = time.time()
     earlier = _earlier(events, status.leases, begin, last_seq, endpoint)
     if not events and not status.leases:
@@ -112,18 +113,16 @@ def _events(
 ) -> Iterator[JsonMap]:
     """Yield the events with numbers between two."""
     while True:
-        events = _checked(history.page(after, history.PAGE, kinds, endpoint))["events"]
+        events = _readable(history.page(after, history.PAGE, kinds, endpoint))["events"]
         yield from (event for event in events if event["seq"] < before)
         if len(events) < history.PAGE or events[-1]["seq"] >= before:
             return
         after = events[-1]["seq"]
 
 
-def _checked(reply: Message) -> Message:
+def _readable(reply: Message) -> Message:
     """Raise the arbiter's error, or a history that cannot be read, as an error."""
-    if not reply.get("ok"):
-        raise from_wire(reply["error"])
-    if reply.get("problem"):
+    if checked(reply).get("problem"):
         raise HistoryUnreadable(reply["problem"], hint="look at the daemon's log and its disk")
     return reply
 

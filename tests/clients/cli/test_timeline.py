@@ -54,6 +54,8 @@ def switched() -> Iterator[ArbiterProcess]:
             held = detector.acquire(spec("detector", 5))
             held.ready(5 * GIB)
             with held.use("detect"):
+                # the other connection may be faster
+                until(lambda: any(one.uses for one in encoder.status().leases))
                 grab.ask(Acquire("grab", spec("grab", 6)))
             until_gone(detector)
             until(lambda: "loading" in logged_states(daemon).get("grab", []))

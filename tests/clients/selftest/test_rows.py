@@ -13,7 +13,7 @@ import pytest
 
 from vram_arbiter.arbiter.host.gpu.fake import make_gpu
 from vram_arbiter.clients.calibration.gpu import Gpu, Reading, fake_gpu
-from vram_arbiter.clients.cli.demo_programs import Programs
+from vram_arbiter.clients.cli.programs import Programs
 from vram_arbiter.clients.selftest import report, rows
 from vram_arbiter.clients.selftest.bed import Bed, Missed, Skipped, answered_within, need
 from vram_arbiter.clients.selftest.run import judged
@@ -27,8 +27,8 @@ from vram_arbiter.schemas.runtime import fakegpu_folder, procfs
 
 def bed_on(gpu: Gpu, folder: Path) -> Bed:
     """Return a bed without a daemon and sidecars."""
-    programs = Programs(folder, gpu.environ)
-    return Bed(gpu, gpu.read(), GIB, GIB, programs, None, (), ())  # type: ignore[arg-type]
+    programs = Programs(folder, dict(gpu.environ))
+    return Bed(gpu, gpu.read(), GIB, programs, None, ())  # type: ignore[arg-type]
 
 
 @pytest.fixture
@@ -93,9 +93,15 @@ def test_a_row_ends_in_one_verdict(
     assert (result["figure"] is None) == (remark != "seen")
 
 
+def test_two_leases_of_all_that_can_be_leased_do_not_fit(bed: Bed) -> None:
+    """What is used already, the reserve, and twice the tolerance are left out."""
+    bed.found = Reading(GIB, {})
+    assert bed.lease_bytes == 7 * GIB - 300 * MIB - 128 * MIB
+
+
 def test_what_a_row_needs_is_named() -> None:
     with pytest.raises(Skipped, match=r"install 'vram-arbiter\[sidecars\]'"):
-        need("json", "no_such_package", extra="sidecars")
+        need("json", "no_such_package")
 
 
 def test_a_driver_that_hangs_is_left_behind() -> None:
