@@ -102,7 +102,7 @@ def _recall(n: int) -> object:
 
 def _is_word(thing: Any) -> bool:
     kind: type = type(thing)
-    return issubclass(kind, str | type) or (_reducer(kind) is _refer and kind is not tuple)
+    return isinstance(thing, str | type) or (kind is not tuple and _reducer(kind) is _refer)
 
 
 # -- what pickle cannot do by itself

@@ -162,7 +162,7 @@ def _writer(kind: type) -> Callable[[_Part, Any], None]:
         return lambda part, some: part.put_all((len(some), *some))
     if is_dataclass(kind):
         names = [one.name for one in fields(kind) if one.name not in LEFT_OUT]
-        values = attrgetter("__module__", "__module__", *names)  # of one name it returns no tuple
+        values = attrgetter("__class__.__name__", "__module__", *names)
         return lambda part, value: part.put_all(values(value))
     return lambda part, value: part.put_all(
         [field for name, field in vars(value).items() if name not in LEFT_OUT]
@@ -188,13 +188,12 @@ def _client(core: Core, client: Client, names: Names) -> _Part:
 
     part.put(client, number(connection._handshake_id))
     for pending in connection._pending.values():
-        part.put(number(pending.id), type(pending.request).__name__, pending)
+        part.put(number(pending.id), pending.request, pending)
     part.put(len(client.up))
     for asked in client.up:
-        part.put(number(asked.id), type(asked.request).__name__, asked.request)
+        part.put(number(asked.id), asked.request)
     for told in client.down:
-        re, body = getattr(told, "request", None), getattr(told, "body", None)
-        part.put(number(re), type(body).__name__, body or told)
+        part.put(number(getattr(told, "request", None)), told)
     mine = {id: nonce for (process, nonce), id in core.nonces.items() if process == client.process}
     part.put(mine)
     return part
