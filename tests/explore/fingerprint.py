@@ -44,7 +44,7 @@ _LEFT_OUT_BECAUSE: Mapping[str, str] = {
     "it is learned, or told alone": "grew_at drifted reading_s evicted charge_bytes held_from"
     " unloading_at released_at verdict_at wait_timeout_s",
     "it is of the protocol, and never changes": "foreign_uses _above _hello _connection _holdings"
-    " instance epoch heartbeat_s grace_s view ttl_s deadline_in_s priority lists",
+    " instance epoch heartbeat_s grace_s view ttl_s deadline_in_s priority",
     "it is of a message, and told alone": "message hint details pid since_s waited_s granted_s"
     " ttl_left_s",
     "it is of the protocol, and an order of messages": "connections lives up down"
