@@ -81,7 +81,7 @@ class SimDevice:
     held: dict[ProcessKey, int] = field(default_factory=dict)
     names: dict[ProcessKey, str] = field(default_factory=dict)
     unlisted: set[ProcessKey] = field(default_factory=set)  # counted in the total only
-    _late: list[tuple[float, ProcessKey, int]] = field(
+    late: list[tuple[float, ProcessKey, int]] = field(
         default_factory=list
     )  # (until, process, bytes still shown)
 
@@ -89,7 +89,7 @@ class SimDevice:
         """The process holds this many bytes now. What it gave up is shown until the lag is over."""
         before = self.held.get(process, 0)
         if count < before and self.lag_s:
-            self._late.append((now + self.lag_s, process, before - count))
+            self.late.append((now + self.lag_s, process, before - count))
         if count:
             self.held[process] = count
         else:
@@ -98,9 +98,9 @@ class SimDevice:
     def shown(self, now: float) -> dict[ProcessKey, int]:
         """Bytes per process as a reading sees them."""
         seen = dict(self.held)
-        for until, process, count in self._late:
-            if until > now:
-                seen[process] = seen.get(process, 0) + count
+        self.late = [part for part in self.late if part[0] > now]
+        for _, process, count in self.late:
+            seen[process] = seen.get(process, 0) + count
         return seen
 
     def read(self, now: float) -> MemorySampled | ProbeFailed:

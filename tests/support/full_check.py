@@ -14,6 +14,7 @@ from vram_arbiter.arbiter.core.ledger import GpuLedger
 from vram_arbiter.arbiter.core.model.gpu import Residents
 from vram_arbiter.arbiter.core.model.lease import AWAY, LeaseState
 from vram_arbiter.arbiter.core.model.state import Client, Core, Turn
+from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas.ids import ClientId, ProcessKey
 
 
@@ -47,6 +48,23 @@ def check_all(core: Core) -> None:
     away = [lease.id for lease in core.leases.values() if lease.state in AWAY]
     if sorted(core.away) != sorted(away):
         raise InvariantViolation(0, f"{sorted(away)} are away, kept as {sorted(core.away)}")
+
+
+def forgotten_waiter(core: Core) -> str:
+    """Return the head of a queue that fits and is not granted, with its GPU; "" if there is none.
+
+    Right whenever the engine rests, and no reading that it asked for is under way.
+    """
+    oldest = core.now - core.settings.sample_max_age_s
+    for gpu in core.gpus.values():
+        head = gpu.queue.head
+        if head is None or core.blocked(gpu) or gpu.asked_at is not None:
+            continue
+        room_bytes = admission.measured_room_bytes(gpu, oldest)
+        needed_bytes = admission.measured_need_bytes(gpu, head)
+        if admission.fits(gpu, head) and room_bytes is not None and room_bytes >= needed_bytes:
+            return f"{head.id} on {gpu.info.id}"
+    return ""
 
 
 def owners_disagree(core: Core) -> str:

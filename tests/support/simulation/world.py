@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import Any
 
 from tests.support.engine_state import state_of
+from tests.support.full_check import forgotten_waiter
 from tests.support.simulation.clock import TRACE_LINES, Clock, ProcessLoop, new_loop
 from tests.support.simulation.daemon import Happening, Machine, SimDaemon
 from tests.support.simulation.device import Device, ProbeFaults
 from tests.support.simulation.wire import Link, SimWire
-from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
@@ -304,18 +304,8 @@ class World:
                 self.fail(f"{device.gpu}: {others} beside the exclusive {exclusive.lease_id}")
 
     def _check_wake_up(self, daemon: SimDaemon) -> None:
-        core = state_of(daemon.core)
-        for gpu in core.gpus.values():
-            head = gpu.queue.head
-            if head is None or core.blocked(gpu) or gpu.asked_at is not None:
-                continue
-            room = admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s)
-            if (
-                admission.fits(gpu, head)
-                and room is not None
-                and room >= admission.measured_need_bytes(gpu, head)
-            ):
-                self.fail(f"lost wake-up: {head.id} fits on {gpu.info.id} and nobody looks")
+        if waiter := forgotten_waiter(state_of(daemon.core)):
+            self.fail(f"lost wake-up: {waiter} fits and is not granted")
 
     # -- running
     def run(self, seconds: float, done: Callable[[], bool] | None = None) -> bool:
