@@ -180,16 +180,6 @@ def two_gpus() -> tuple[CoreDriver, LeaseId, Consumer, LeaseId]:
     return driver, idle, slow, loading
 
 
-def test_a_load_elsewhere_is_waited_for_as_long_as_a_holder_that_was_asked() -> None:
-    driver, idle, _, loading = two_gpus()
-    granted_at = driver.arbiter.inspect().leases[loading].granted_at
-    driver.consumer("w").acquire(4 * GIB)
-    driver.advance(granted_at + d.REVOKE_DEADLINE_S - 0.001 - driver.now)
-    assert driver.state(idle) == "held"
-    driver.advance(0.001)
-    assert driver.state(idle) == "revoking"
-
-
 @pytest.mark.parametrize(
     "trouble", ["it cannot be read", "pressure", "it has not been read since a suspend"]
 )
@@ -209,9 +199,6 @@ def test_a_load_on_a_gpu_in_trouble_is_not_waited_for(trouble: str) -> None:
         device.set(ProcessKey(9, 9), 0, driver.now)
     driver.consumer("w").acquire(4 * GIB)
     assert driver.state(idle) == "revoking"
-
-
-# -- who has not come back
 
 
 # -- residues in the journal

@@ -29,19 +29,6 @@ def test_a_restart_keeps_it_and_waits_for_its_holder(driver: CoreDriver) -> None
     driver.advance(60.0)
 
 
-def test_a_holder_that_does_not_come_back_loses_it(driver: CoreDriver) -> None:
-    _, lease, policy, wanted = sent_away(driver, ttl_s=10.0)
-    policy_token = policy.token(wanted)
-    driver.restart()
-    policy.connect()
-    policy.reattach(wanted, policy_token)
-    driver.advance(14.9)
-    assert driver.state(lease) == "standby"
-    driver.advance(0.2)
-    assert driver.state(lease) == "over"
-    assert f"lease:{lease}" not in driver.journal
-
-
 def test_who_asks_for_it_anew_before_re_attaching_has_come_back(driver: CoreDriver) -> None:
     """After a restart it asks for the model again, and waits for longer than a holder has time to
     come back."""
