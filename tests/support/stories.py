@@ -36,7 +36,7 @@ REPEATED = ("LeaseView", "LeaseRecord", "Explanation", "LeaseDetail", "GpuView",
 PLAIN = ("client", "body", "refusal", "about", "key", "record", *KEYS)
 """Fields that are shown without their names."""
 LEFT_OUT = ("request",)
-"""Numbers of requests: the driver checks them, and one command more would change all that follow."""
+"""The driver checks the numbers of requests, and one command more would change all that follow."""
 LAYOUT = TextWrapper(100, "  ", " " * 6, break_long_words=False, break_on_hyphens=False)
 SUFFIXES = ("Note", "Push", "Reply", "View", "Record")
 
