@@ -27,8 +27,8 @@ NOT_OF_A_LEASE = frozenset(
 
 
 def well_formed(event: Event, effects: Sequence[Effect], state: Inspection) -> None:
-    """Every request has its one answer, notes name their lease, and every field of an effect and of
-    the leases that notes are about is of its type. Raises AssertionError."""
+    """Raise AssertionError unless every request has its one answer, notes name their lease, and
+    every field of an effect, and of the leases that notes are about, is of its type."""
     asked = [(event.client, event.id)] if isinstance(event, Asked) else []
     answered = [(e.client, e.request) for e in effects if isinstance(e, Reply | Refuse)]
     if answered != asked:

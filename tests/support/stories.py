@@ -33,8 +33,10 @@ KEYS = ("lease_id", "gpu")
 QUIET = (events.Tick, events.MemorySampled, events.ProbeFailed)
 REPEATED = ("LeaseView", "LeaseRecord", "Explanation", "LeaseDetail", "GpuView", "StatusReply")
 """Dataclasses that are shown by what changed."""
-PLAIN = ("client", "request", "body", "refusal", "about", "key", "record", *KEYS)
+PLAIN = ("client", "body", "refusal", "about", "key", "record", *KEYS)
 """Fields that are shown without their names."""
+LEFT_OUT = ("request",)
+"""The driver checks the numbers of requests, and one command more would change all that follow."""
 LAYOUT = TextWrapper(100, "  ", " " * 6, break_long_words=False, break_on_hyphens=False)
 SUFFIXES = ("Note", "Push", "Reply", "View", "Record")
 
@@ -143,7 +145,7 @@ class _Story:
         shown = [
             ("" if name in PLAIN else f"{_short(name)}=") + self._words(own[name], name)
             for name, usual in ((field.name, _usual(field)) for field in fields(value))
-            if name == key or own[name] != before.get(name, usual)
+            if name not in LEFT_OUT and (name == key or own[name] != before.get(name, usual))
         ]
         short = next((kind.removesuffix(one) for one in SUFFIXES if kind.endswith(one)), "") or kind
         return f"{short}({' '.join(shown)})"

@@ -421,13 +421,10 @@ class Core:
             self.gpus[gpu_id].wake()
 
     def deny(self, waiter: Lease, refusal: Refusal) -> None:
-        """End a wait with a refusal."""
+        """End a wait with a refusal. Its request was answered as queued."""
         self.move(waiter, LeaseState.DENIED, refusal.code)
         self.dequeue(waiter)
-        if waiter.request.answered or waiter.request.id is None:
-            self.push(waiter, DeniedPush(waiter.id, refusal.view()))
-        else:  # it has only just asked
-            self.refuse(waiter.client, waiter.request.id, refusal)
+        self.push(waiter, DeniedPush(waiter.id, refusal.view()))
         self.note(DeniedNote(refusal), waiter)
         self.end(waiter, refusal)
 

@@ -4,7 +4,6 @@ import pytest
 
 from tests.support.core_driver import CoreDriver, refusal
 from tests.support.scenes import held, in_use, revoked, shown
-from vram_arbiter.arbiter.core.effects import Sample
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import GpuId, LeaseId
@@ -124,16 +123,6 @@ def test_within_the_tolerance_nobody_drifts(
     driver.advance(2.0)
     det.unload(lease)
     assert [note["part"] for note in driver.notes("drift")] == parts
-
-
-def test_while_somebody_loads_the_gpu_is_read_twenty_times_a_second(driver: CoreDriver) -> None:
-    driver.consumer("det").acquire(2 * GIB)
-    driver.advance(0.1)
-    before = len(driver.effects)
-    driver.advance(1.0)
-    assert sum(isinstance(effect, Sample) for effect in driver.effects[before:]) == pytest.approx(
-        20, abs=1
-    )
 
 
 def test_a_load_that_is_cut_off_teaches_only_that_it_was_too_much(driver: CoreDriver) -> None:

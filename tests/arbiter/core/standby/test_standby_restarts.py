@@ -31,19 +31,6 @@ def test_a_restart_keeps_it_and_waits_for_its_holder(driver: CoreDriver) -> None
     driver.advance(60.0)
 
 
-def test_a_holder_that_does_not_come_back_loses_it(driver: CoreDriver) -> None:
-    _, lease, policy, wanted = sent_away(driver, ttl_s=10.0)
-    policy_token = policy.token(wanted)
-    driver.restart()
-    policy.connect()
-    policy.reattach(wanted, policy_token)
-    driver.advance(14.9)
-    assert driver.state(lease) == "standby"
-    driver.advance(0.2)
-    assert driver.state(lease) == "over"
-    assert f"lease:{lease}" not in driver.journal
-
-
 @pytest.mark.parametrize("measured", [True, False])
 def test_a_holder_that_does_not_come_back_to_its_verdict_loses_it(
     driver: CoreDriver, measured: bool
