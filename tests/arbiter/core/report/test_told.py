@@ -8,7 +8,6 @@ import pytest
 
 from tests.support.core_driver import START_S, CoreDriver, answer, as_wire, refusal
 from tests.support.scenes import give_back, held, in_use, order, sent_away, shown
-from vram_arbiter.arbiter.core.events import ProbeFailed
 from vram_arbiter.arbiter.core.model.lease import Lease
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
@@ -356,16 +355,6 @@ def test_an_answer_to_revoke_is_noted_with_its_lease(driver: CoreDriver) -> None
     det.ack(lease, eta_s=0.5)
     note = only(driver.notes("revoke_acked"))
     assert (note["lease_id"], note["safe_point_eta_s"], note["uses"]) == (lease, 0.5, 0)
-
-
-def test_a_gpu_is_stale_when_its_newest_reading_may_gate_no_grant(driver: CoreDriver) -> None:
-    arbiter, age_s = driver.arbiter, driver.settings.sample_max_age_s
-    driver.consumer("det")
-    assert arbiter.stale(driver.now) == []
-    driver.device.silent = True
-    assert arbiter.stale(driver.now + age_s + 0.1) == [driver.device.gpu]
-    driver.post(ProbeFailed(driver.device.gpu, driver.now + age_s, "no answer"))
-    assert arbiter.stale(driver.now + age_s + 0.1) == [], "a failed reading is news as well"
 
 
 def test_the_time_since_the_grant_outlives_a_restart(driver: CoreDriver) -> None:
