@@ -131,6 +131,6 @@ def residents_disagree(residents: Residents) -> str:
     if odd := listed ^ {(lease.id, lease.state) for lease in residents.values()}:
         return f"{sorted(odd)}: states are listed otherwise than they are"
     exclusive = {lease.id for lease in residents.values() if lease.spec.exclusive}
-    if residents.exclusive.keys() != exclusive:
+    if residents.exclusive != exclusive:
         return f"{sorted(residents.exclusive)} are listed as exclusive"
     return ""

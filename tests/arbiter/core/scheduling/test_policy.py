@@ -12,7 +12,7 @@ from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import LeaseId
-from vram_arbiter.schemas.wire.codes import Block
+from vram_arbiter.schemas.wire.codes import Block, Order
 
 
 class Scene:
@@ -205,6 +205,48 @@ def test_a_reading_that_is_missing_failed_or_old_gives_no_room() -> None:
     assert admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s) == 8 * GIB
     core.now += 5.0
     assert admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s) is None
+
+
+def test_a_gpu_that_grants_nothing_names_the_first_of_its_reasons() -> None:
+    scene = Scene()
+    core, gpu = state_of(scene.driver.arbiter), scene.gpu
+    loading = core.leases[scene.driver.consumer("a").acquire(1 * GIB)]
+    sample, gpu.sample = gpu.sample, None
+    core.serving, core.drain, gpu.failed_at, gpu.ledger.pressed = (
+        False,
+        Order("ops", "test"),
+        1.0,
+        True,
+    )
+    found = [core.blocked(gpu)]
+    for owner, name, value in (
+        (core, "serving", True),
+        (core, "drain", None),
+        (gpu, "failed_at", None),
+        (gpu, "sample", sample),
+        (gpu.residents, "by_state", {**gpu.residents.by_state, loading.state: {}}),
+        (gpu.ledger, "pressed", False),
+    ):
+        setattr(owner, name, value)
+        found.append(core.blocked(gpu))
+    assert found == [
+        Block.RECOVERING,
+        Block.DRAINED,
+        Block.UNREADABLE,
+        Block.UNREAD,
+        Block.LOADING,
+        Block.PRESSURE,
+        None,
+    ]
+
+
+@pytest.mark.parametrize(("more", "state"), [(0, "loading"), (1, "queued")])
+def test_the_last_byte_is_granted_and_no_more(more: int, state: str) -> None:
+    scene = Scene()
+    scene.hold("busy", 5)
+    scene.use("busy")
+    lease = scene.driver.consumer("w").acquire(3 * GIB + more, priority=10)
+    assert scene.driver.state(lease) == state
 
 
 def test_the_measured_need_is_less_by_what_the_process_holds() -> None:

@@ -28,6 +28,8 @@ def test_the_detector_returns_by_itself_after_the_grab(driver: CoreDriver) -> No
     det.load(lease)
     view = shown(driver, lease)
     assert (view["state"], view["standby"], view["charge_bytes"]) == ("held", True, 5 * GIB)
+    story = [(str(state), why) for _, state, why in driver.arbiter.inspect().leases[lease].story]
+    assert [why for state, why in story if state == "loading"] == ["granted", "returned"]
     assert driver.notes("granted")[-1]["by_itself"] is True
     assert driver.notes("switch")[-1]["switched"] is False
 
