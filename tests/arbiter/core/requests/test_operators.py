@@ -212,17 +212,6 @@ def test_only_an_operators_pin_is_undone(driver: CoreDriver, ops: Consumer) -> N
         assert (details["problem"], details.get("evictable", True)) == ("not_pinned", evictable)
 
 
-def test_a_pin_outlives_the_daemon(driver: CoreDriver, ops: Consumer) -> None:
-    det, lease = held(driver, "det", 5)
-    order_of(ops, "pin", lease, "why not")
-    token = det.token(lease)
-    driver.restart()
-    det.connect()
-    det.reattach(lease, token)
-    view = shown(driver, lease)
-    assert view["pinned"] == f"{BY}: why not"
-
-
 # -- drain
 def test_a_drained_arbiter_grants_nothing_and_keeps_what_is_held(
     driver: CoreDriver, ops: Consumer
