@@ -17,7 +17,6 @@ Its ends: `dismiss` by an operator, `give_up` by its holder, `Core.end_away`.
 """
 
 from collections.abc import Iterable, Mapping
-from functools import partial
 
 from vram_arbiter.arbiter.core import events as ev
 from vram_arbiter.arbiter.core.model import refusals as no
@@ -149,8 +148,10 @@ def first_to_return(away: Mapping[LeaseId, Lease], gpu: Gpu) -> Lease | None:
     ahead, *others = in_turn
     if ahead.spec.exclusive:
         return None
-    passed = partial(_returned_since, ahead.standby.since)
-    spare_bytes, _ = admission.spare_unplanned_bytes(gpu, ahead, {}, passed)
+    since = ahead.standby.since
+    spare_bytes, _ = admission.spare_unplanned_bytes(
+        gpu, ahead, {}, lambda one: one.standby.returned and one.granted_at >= since
+    )
     beside = (one for one in others if admission.added_bytes(gpu, one) <= spare_bytes)
     return next((one for one in beside if admission.fits(gpu, one)), None)
 
@@ -164,9 +165,7 @@ def quiet_at(gpu: Gpu, lease: Lease) -> float:
 def left_for_is_here(gpu: Gpu, lease: Lease) -> bool:
     """Return whether the consumer that a lease left for is on a GPU."""
     left_for = lease.standby.left_for
-    return bool(left_for) and any(
-        other.spec.consumer == left_for for other in gpu.residents.values()
-    )
+    return any(other.spec.consumer == left_for for other in gpu.residents.values())
 
 
 def _by_turn(away: Mapping[LeaseId, Lease], gpu: Gpu) -> list[Lease]:
@@ -184,8 +183,3 @@ def _by_turn(away: Mapping[LeaseId, Lease], gpu: Gpu) -> list[Lease]:
         found,
         key=lambda lease: (-lease.spec.priority, lease.standby.since, lease.request.arrival),
     )
-
-
-def _returned_since(since: float, other: Lease) -> bool:
-    """Return whether a resident came back by itself after that moment."""
-    return other.standby.returned and other.granted_at >= since

@@ -7,6 +7,7 @@ also check everything, in O(leases).
 from collections import Counter
 
 from tests.support.engine_state import state_of
+from tests.support.typed import missing
 from vram_arbiter.arbiter.core import invariants
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.invariants import InvariantViolation
@@ -25,7 +26,7 @@ def check_arbiter(arbiter: Arbiter) -> None:
 
 def check_all(core: Core) -> None:
     """Raise InvariantViolation if any record is unsound; number 0: a table is."""
-    if problem := owners_disagree(core):
+    if problem := values_missing(core) or owners_disagree(core):
         raise InvariantViolation(0, problem)
     for gpu in core.gpus.values():
         if problem := ledger_disagrees(gpu.ledger) or residents_disagree(gpu.residents):
@@ -65,6 +66,24 @@ def forgotten_waiter(core: Core) -> str:
         if admission.fits(gpu, head) and room_bytes is not None and room_bytes >= needed_bytes:
             return f"{head.id} on {gpu.info.id}"
     return ""
+
+
+def values_missing(core: Core) -> str:
+    """Return what is None and may not be, "" if nothing is."""
+    records: list[object] = [*core.gpus.values(), *core.clients.values()]
+    plain: list[object] = [core]
+    for gpu in core.gpus.values():
+        plain.append(gpu.ledger)
+        records += [*gpu.verifications.values(), *gpu.evictions, *gpu.ledger.accounts.values()]
+    for lease in core.leases.values():
+        records += [lease, lease.request, lease.departure, lease.standby, lease.observed]
+        records += lease.uses.values()
+        if None in lease.story[-1]:
+            return f"{lease.id}: {lease.story[-1]}"
+    if odd := next(filter(None, map(missing, records)), ""):
+        return odd
+    told = [(name, value) for one in plain for name, value in vars(one).items()]
+    return next((name for name, value in told if value is None and name != "drain"), "")
 
 
 def owners_disagree(core: Core) -> str:
@@ -130,6 +149,6 @@ def residents_disagree(residents: Residents) -> str:
     if odd := listed ^ {(lease.id, lease.state) for lease in residents.values()}:
         return f"{sorted(odd)}: states are listed otherwise than they are"
     exclusive = {lease.id for lease in residents.values() if lease.spec.exclusive}
-    if residents.exclusive.keys() != exclusive:
+    if residents.exclusive != exclusive:
         return f"{sorted(residents.exclusive)} are listed as exclusive"
     return ""

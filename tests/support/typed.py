@@ -30,6 +30,22 @@ def mistyped(value: object) -> str:
     return ""
 
 
+def missing(value: object) -> str:
+    """Return the first field of a dataclass that is None and may not be, as `Class.field`; "" if
+    there is none. A look for records that change with every event."""
+    cls: Any = type(value)
+    names = _required(cls)
+    if None not in [getattr(value, name) for name in names]:
+        return ""
+    return next(f"{cls.__name__}.{name}" for name in names if getattr(value, name) is None)
+
+
+@cache
+def _required(cls: Any) -> list[str]:
+    hints = get_type_hints(cls)
+    return [field.name for field in fields(cls) if type(None) not in get_args(hints[field.name])]
+
+
 @cache
 def _fields(cls: Any) -> list[tuple[str, _Check]]:
     hints = get_type_hints(cls)

@@ -37,7 +37,7 @@ class Residents(dict[LeaseId, Lease]):
     def __init__(self) -> None:
         super().__init__()
         self.by_state: dict[LeaseState, dict[LeaseId, Lease]] = {state: {} for state in LeaseState}
-        self.exclusive: dict[LeaseId, Lease] = {}
+        self.exclusive: set[LeaseId] = set()
         self.recent: dict[LeaseId, Lease] = {}
         """Leases granted or ready since the newest reading began; may hold more."""
         self.touched: set[LeaseId] = set()
@@ -49,14 +49,15 @@ class Residents(dict[LeaseId, Lease]):
         self[lease.id] = self.by_state[lease.state][lease.id] = self.recent[lease.id] = lease
         self.touched.add(lease.id)
         if lease.spec.exclusive:
-            self.exclusive[lease.id] = lease
+            self.exclusive.add(lease.id)
 
     def remove(self, lease: Lease) -> None:
         """Take a lease off the GPU, if it is there."""
         if lease.id not in self:
             return
-        for table in (self, self.by_state[lease.state], self.exclusive, self.recent):
+        for table in (self, self.by_state[lease.state], self.recent):
             table.pop(lease.id, None)
+        self.exclusive.discard(lease.id)
         self.touched.add(lease.id)
 
     def moved(self, lease: Lease, before: LeaseState) -> None:

@@ -17,7 +17,6 @@ Per GPU, in this order (the numbers stand in `_serve`):
 """
 
 from collections.abc import Sequence
-from itertools import islice
 
 from vram_arbiter.arbiter.core import eviction, standby
 from vram_arbiter.arbiter.core.model.gpu import Gpu
@@ -33,19 +32,15 @@ from vram_arbiter.schemas.wire.replies import AcquireReply
 
 
 def schedule(core: Core) -> None:
-    """Serve every dirty GPU, in turn, until none is dirty: a grant on one may free a waiter's place
-    on another.
-    """
-    last = -1
+    """Serve dirty GPUs until none is dirty: a grant on one may free a waiter's place on another."""
     while dirty := [gpu for gpu in core.gpus.values() if gpu.dirty]:
         for gpu in dirty:  # first: a choice among GPUs must not count on room of such
             if (note := gpu.ledger.note_pressure()) is not None:
                 core.note(note)
             gpu.blocked = core.blocked(gpu)
             eviction.take_back(core, gpu)  # 0
-        gpu = next((gpu for gpu in dirty if gpu.info.index > last), dirty[0])
-        last, gpu.dirty = gpu.info.index, False
-        _serve(core, gpu)
+        dirty[0].dirty = False
+        _serve(core, dirty[0])
     eviction.settle(core)
 
 
@@ -64,8 +59,7 @@ def _serve(core: Core, gpu: Gpu) -> None:
             _take_over(core, gpu)
         return
     if gpu.queue.head is None:  # 3
-        if core.away:
-            _bring_back(core, gpu)
+        _bring_back(core, gpu)
         return
     head = admission.front(core.gpus, gpu)
     if head is None:
@@ -111,7 +105,7 @@ def _make_room(core: Core, gpu: Gpu, head: Lease) -> bool:
     head fits once all that leave have left.
     """
     request, leaving = head.request, admission.leaving(gpu)
-    if leaving and admission.fits(gpu, head, leaving):
+    if admission.fits(gpu, head, leaving):
         request.reason = Wait.MAKING_ROOM
         return True
     if admission.residue_under_measurement(gpu):
@@ -162,8 +156,6 @@ def _is_best_place(
     core: Core, choice: Choice, gpu: Gpu, waiter: Lease, plan: Sequence[Lease]
 ) -> bool:
     """Return whether emptying this GPU is the cheapest of its candidates. Wakes a better one."""
-    if len(waiter.request.gpus) == 1:
-        return True
     best, best_cost = gpu, _place_cost(gpu, plan)
     for gpu_id in waiter.request.gpus:
         other = core.gpus[gpu_id]
@@ -269,9 +261,10 @@ def choose_later(gpu: Gpu, head: Lease, *, planned: bool) -> Lease | None:
         return None
     fold = _largest_fold_bytes(gpu)
     smallest, free = queue.smallest_need_bytes() - fold, ledger.budget_bytes - ledger.total_bytes()
-    if smallest > free or _room_is_coming(gpu):
-        return None  # a load now would only be in the way of the head's room
     going, stuck = admission.leaving(gpu), False
+    away_soon = gpu.in_state(LeaseState.UNLOADING, LeaseState.VERIFYING)
+    if smallest > free or any(lease.id in going for lease in away_soon):
+        return None  # a load now would only be in the way of the head's room
     if planned:
         spare = ledger.budget_bytes - ledger.total_if(going, admission.joining(head))
     else:
@@ -281,12 +274,9 @@ def choose_later(gpu: Gpu, head: Lease, *, planned: bool) -> Lease | None:
     if smallest > spare or (stuck and admission.residue_under_measurement(gpu)):
         return None
     most = min(free, spare) + fold
-    alone = not ledger.charges
-    for lease in islice(queue, 1, None):
-        if lease.request.load_peak_bytes > most or (lease.spec.exclusive and not alone):
+    for lease in queue:
+        if lease is head or lease.request.load_peak_bytes > most:
             continue  # seen at a glance: thousands may wait
-        if lease is head:
-            continue
         if stuck and not lease.evictable:
             continue  # the head may need its bytes once a stowaway leaves
         if admission.added_bytes(gpu, lease) <= spare and admission.fits(gpu, lease):
@@ -299,15 +289,6 @@ def _largest_fold_bytes(gpu: Gpu) -> int:
     accounts, stowaways = gpu.ledger.accounts.values(), gpu.ledger.stowaways.values()
     folded = [account.retained_bytes + account.measured_bytes for account in accounts]
     return max([*folded, *(stowaway.held_bytes for stowaway in stowaways)], default=0)
-
-
-def _room_is_coming(gpu: Gpu) -> bool:
-    """Return whether a lease unloads or is verified, and is not late with it."""
-    for lease in gpu.in_state(LeaseState.UNLOADING, LeaseState.VERIFYING):
-        verification = gpu.verifications.get(lease.id)
-        if not (verification.overdue if verification else lease.departure.hangs):
-            return True
-    return False
 
 
 def _passed(gpu: Gpu, lease: Lease, head: Lease) -> bool:

@@ -64,11 +64,7 @@ class Choice:
         if lease.uses.unclaimed:
             return lease.ready_at
         stay_s = lease.spec.min_residency_s
-        if (
-            self.costs.switches
-            and waiter is not None
-            and waiter.spec.priority <= lease.spec.priority
-        ):
+        if waiter is not None and waiter.spec.priority <= lease.spec.priority:
             switch_s = self.costs.switch_s(lease.spec.consumer, waiter.spec.consumer, self.now)
             stay_s = max(stay_s, min(switch_s, self.settings.thrash_hold_max_s))
         return lease.ready_at + stay_s
@@ -134,8 +130,6 @@ class Choice:
 
         if not rest or not covers(rest):
             return None
-        if len(rest) == 1:
-            return must + rest
         return must + self._search(gpu, base, rest, covers)
 
     def _search(

@@ -206,7 +206,7 @@ def state_off(b: Broken) -> None:
 
 
 def exclusive_off(b: Broken) -> None:
-    b.gpu.residents.exclusive[b.held.id] = b.held
+    b.gpu.residents.exclusive.add(b.held.id)
 
 
 def client_off(b: Broken) -> None:

@@ -8,6 +8,7 @@ from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
 from vram_arbiter.arbiter.core.ledger import GpuLedger, bytes_of
 from vram_arbiter.arbiter.core.settings import GpuInfo
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
+from vram_arbiter.schemas.wire.notes import OverHolder, PressureNote
 
 A, B, C = ProcessKey(1, 1), ProcessKey(2, 2), ProcessKey(3, 3)
 LA, LA2, LB = LeaseId("La"), LeaseId("La2"), LeaseId("Lb")
@@ -110,6 +111,17 @@ def test_pressure_is_what_exceeds_the_budget() -> None:
     assert books.pressure_bytes() == 0, "within the tolerance"
     books.observe(sample(3.0, 950, (A, 800), (C, 150)), quiet=True)
     assert books.pressure_bytes() == 50
+
+
+def test_a_note_of_pressure_names_holders_beyond_the_tolerance() -> None:
+    books = ledger()
+    books.charge(LA, A, 400, 400, 1.0)
+    books.charge(LB, B, 300, 300, 1.0)
+    books.observe(sample(2.0, 1021, (A, 410), (B, 311), (C, 300)), quiet=True)
+    assert books.note_pressure() == PressureNote(GPU, 121, 300, (OverHolder(B.pid, 11),))
+    assert books.note_pressure() is None
+    books.observe(sample(3.0, 700, (A, 400), (B, 300)), quiet=True)
+    assert books.note_pressure() == PressureNote(GPU, 0, 0, ())
 
 
 def test_stowaways_are_named_and_leave_no_trace_once_they_lease() -> None:

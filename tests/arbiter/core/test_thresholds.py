@@ -188,6 +188,18 @@ def test_a_load_on_a_gpu_in_trouble_is_not_waited_for(trouble: str) -> None:
     assert driver.state(idle) == "revoking"
 
 
+@pytest.mark.parametrize(
+    ("more", "noted"), [(d.VERIFY_TOLERANCE_BYTES, 1), (d.VERIFY_TOLERANCE_BYTES + 1, 2)]
+)
+def test_a_stowaway_is_noted_again_if_it_has_grown_by_more_than_the_tolerance(
+    driver: CoreDriver, more: int, noted: int
+) -> None:
+    for count in (GIB, GIB + more, GIB + more):
+        stranger(driver, 9, count)
+        driver.advance(1.5)
+    assert len(driver.notes("stowaway")) == noted
+
+
 # -- residues in the journal
 def restarted_with(driver: CoreDriver, person: Consumer, **changes: Any) -> None:
     """A restart that finds another record of what the process keeps."""
@@ -239,6 +251,6 @@ def test_what_a_restart_found_is_told_and_what_is_of_a_gpu_that_is_gone_is_taken
         **gone,
     }
     driver.restart()
-    recovered = driver.notes("recovered")[-1]
-    assert (recovered["leases"], recovered["records"]) == ([lease], 4)
+    recovered = {"kind": "recovered", "leases": [lease], "records": 4}
+    assert driver.notes("recovered") == [recovered]
     assert driver.journal.keys() == {f"lease:{lease}", f"residue:{person.process}:GPU-0"}

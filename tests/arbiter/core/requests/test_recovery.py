@@ -1,11 +1,14 @@
 """A restart of the daemon alone: what the journal names stays charged, holders come back, and
 nobody is granted before."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.engine_state import state_of
 from tests.support.scenes import give_back
 from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.arbiter.core.events import (
@@ -15,10 +18,19 @@ from vram_arbiter.arbiter.core.events import (
     MemorySampled,
     Recovered,
 )
-from vram_arbiter.arbiter.core.model.lease import Use
+from vram_arbiter.arbiter.core.model.lease import (
+    Departure,
+    Lease,
+    LeaseState,
+    Observed,
+    Request,
+    Standby,
+    Use,
+)
 from vram_arbiter.arbiter.host.records import records_of
 from vram_arbiter.schemas.defaults import GIB, MIB
-from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, Token, UseId
+from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, Token, UseId
+from vram_arbiter.schemas.wire.codes import Order
 from vram_arbiter.schemas.wire.requests import UseBegin
 
 
@@ -32,6 +44,101 @@ def held_with_token(
     person.load(lease)
     driver.advance(0.01)
     return person, lease, token
+
+
+def loads(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
+    """It has not said that it is ready."""
+
+
+def is_used(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
+    det.load(lease, 3 * GIB)
+    det.use_begin(lease, "own")
+    driver.consumer("runner", pid=7).use_begin(lease, "goal", det.token(lease), "grab")
+    driver.consumer("ops").order("pin", lease)
+
+
+def is_revoked(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
+    det.load(lease)
+    driver.consumer("w").acquire(5 * GIB)
+
+
+def unloads(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
+    is_revoked(driver, det, lease)
+    det.unloading(lease)
+
+
+def exits(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
+    unloads(driver, det, lease)
+    driver.device.silent = True
+    det.release(lease, exiting=True)
+
+
+def parks(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
+    is_revoked(driver, det, lease)
+    det.unload(lease, parked=True)
+
+
+RUNNER = ProcessKey(7, 49)
+USES = {(RUNNER, UseId("goal")): Use(UseId("goal"), ClientId(""), RUNNER, "grab", 0.0)}
+PINNED = {"uses": USES, "pinned": Order("ops", "test"), "observed": Observed(3 * GIB)}
+REVOKED = {"departure": Departure(revoked_before=True), "standby": Standby("w")}
+EXITS = {"departure": Departure(exiting=True), "standby": Standby("w")}
+PARKED = {"gpu": None, "standby": Standby("w", comes_back=True, parks=True)}
+
+
+@pytest.mark.parametrize(
+    ("bring", "state", "fields", "timers", "parked_bytes"),
+    [
+        (loads, "loading", {}, {"ttl": 15.0}, 0),
+        (is_used, "held", PINNED, {"ttl": 15.0, "users": 15.0}, 0),
+        (is_revoked, "held", REVOKED, {"ttl": 15.0}, 4 * GIB),
+        (unloads, "held", REVOKED, {"ttl": 15.0}, 4 * GIB),
+        (exits, "verifying", EXITS, {"away": 15.0}, 0),
+        (parks, "parked", PARKED, {"away": 15.0}, 4 * GIB),
+    ],
+)
+def test_a_restart_finds_a_lease_as_the_journal_has_it(
+    bring: Callable[[CoreDriver, Consumer, LeaseId], None],
+    state: str,
+    fields: dict[str, Any],
+    timers: dict[str, float],
+    parked_bytes: int,
+) -> None:
+    """`timers`: seconds from the restart, the time to live or a silent holder's, and the grace."""
+    driver = CoreDriver(8 * GIB, settings={"host_ram_budget_bytes": 8 * GIB})
+    det = driver.consumer("det")
+    lease = det.acquire(5 * GIB, 4 * GIB, standby=True, park_bytes=4 * GIB, ttl_s=10.0)
+    driver.advance(1.0)
+    bring(driver, det, lease)
+    driver.advance(1.0)
+    before = driver.arbiter.inspect().leases[lease]
+    driver.restart(start=False)
+    core, now = state_of(driver.arbiter), driver.now
+    request = Request("n1", now, 1, 5 * GIB, 4 * GIB, (GpuId("GPU-0"),), answered=True)
+    found = Lease(
+        lease,
+        before.spec,
+        det.process,
+        ClientId(""),
+        request,
+        state=LeaseState(state),
+        token=before.token,
+        gpu=GpuId("GPU-0"),
+        granted_at=now,
+        held_from=before.held_from,
+        ready_at=now,
+        expires_at=now + timers.get("ttl", -now),
+        attached=False,
+        story=[(now, LeaseState(state), "recovered")],
+    )
+    uses = {key: replace(use, began_at=now) for key, use in fields.get("uses", {}).items()}
+    standby = replace(fields.get("standby", Standby()), since=now)
+    assert core.leases[lease] == replace(found, **{**fields, "uses": uses, "standby": standby})
+    set_for = {kind: at - now for (kind, of), at in core.timers.items() if of == lease}
+    assert set_for == pytest.approx(timers)
+    assert (lease in core.recovering) == ("ttl" in timers)
+    assert core.host_ram.booked.get(lease, 0) == parked_bytes
+    assert core.nonces[det.process, "n1"] == lease
 
 
 def test_re_attaching_to_a_daemon_that_did_not_restart_only_moves_the_connection() -> None:
@@ -208,6 +315,7 @@ def test_a_debt_keeps_its_fence_grace_over_a_restart(driver: CoreDriver) -> None
             {"held": True, "measured_bytes": 4 * GIB},
             {"state": "held", "gpu": "GPU-0", "charge_bytes": 4 * GIB, "measured_bytes": 4 * GIB},
         ),
+        ({"held": True}, {"state": "held", "gpu": "GPU-0", "charge_bytes": 3 * GIB}),
         ({"held": False}, {"state": "loading", "gpu": "GPU-0", "charge_bytes": 5 * GIB}),
         ({"away": True}, {"state": "standby", "comes_back": True}),
         (

@@ -1,5 +1,6 @@
 """Who leaves: the cheapest set that covers the need, nobody in vain."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -7,12 +8,12 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.engine_state import state_of
 from vram_arbiter.arbiter.core.model.gpu import Gpu
-from vram_arbiter.arbiter.core.model.lease import Lease
+from vram_arbiter.arbiter.core.model.lease import Lease, Verification
 from vram_arbiter.arbiter.core.scheduling import admission
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import LeaseId
-from vram_arbiter.schemas.wire.codes import Block
+from vram_arbiter.schemas.wire.codes import Block, Order
 
 
 class Scene:
@@ -195,16 +196,90 @@ def test_greedy_gives_back_who_is_not_needed() -> None:
     assert scene.want(8.9) == {"high"}
 
 
-def test_a_reading_that_is_missing_failed_or_old_gives_no_room() -> None:
-    driver = CoreDriver(8 * GIB, start=False)
-    core = state_of(driver.arbiter)
-    gpu = next(iter(core.gpus.values()))
-    assert admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s) is None
-    assert core.blocked(gpu) == Block.UNREAD
-    driver.advance(0.01)
-    assert admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s) == 8 * GIB
-    core.now += 5.0
-    assert admission.measured_room_bytes(gpu, core.now - core.settings.sample_max_age_s) is None
+DEBT: dict[str, Any] = {"confirmed_at": 100.001, "baseline_comparable": False}
+ROOM: dict[str, tuple[dict[str, Any], int | None]] = {
+    "what is free": ({}, 7 * GIB),
+    "no reading": ({"gpu": {"sample": None}}, None),
+    "a failed one since": ({"gpu": {"failed_at": 1.0}}, None),
+    "old enough": ({"oldest": 100.0}, 7 * GIB),
+    "too old": ({"oldest": 100.001}, None),
+    "a smaller GPU than it was": ({"sample": {"total_bytes": 6 * GIB}}, 5 * GIB),
+    "a cap": ({"sample": {"total_bytes": 9 * GIB}}, 7 * GIB),
+    "ready as it began": ({"lease": {"ready_at": 100.0}}, 7 * GIB),
+    "ready since: its load peak": ({"lease": {"ready_at": 100.001}}, 4 * GIB),
+    "granted since": ({"lease": {"granted_at": 100.001}}, 4 * GIB),
+    "ready since, and charged more": ({"lease": {"ready_at": 100.001}, "charge": 4}, 3 * GIB),
+    "granted and lost since": ({"debt": {}}, None),
+    "lost as it began": ({"debt": {"confirmed_at": 100.0}}, 7 * GIB),
+    "lost since, and seen before": ({"debt": {"baseline_comparable": True}}, 7 * GIB),
+    "released since": ({"debt": {"lease": LeaseId("L1-1")}}, 7 * GIB),
+}
+
+
+@pytest.mark.parametrize("case", ROOM)
+def test_room_by_measurement(case: str) -> None:
+    """A reading of 1 GiB began at 100 s; a lease of 2 GiB took 3 in its load before that."""
+    changes, room = ROOM[case]
+    scene = Scene(8 * GIB)
+    lease = state_of(scene.driver.arbiter).leases[scene.hold("a", 3, steady_bytes=2 * GIB)]
+    gpu = scene.gpu
+    assert gpu.sample is not None
+    sample = replace(gpu.sample, taken_at=100.0, used_bytes=GIB)
+    gpu.sample = replace(sample, **changes.get("sample", {}))
+    lease.granted_at = lease.ready_at = 90.0
+    gpu.residents.recent[lease.id] = lease
+    gpu.ledger.recharge(lease.id, changes.get("charge", 2) * GIB, 90.0)
+    for record, fields in ((gpu, "gpu"), (lease, "lease")):
+        for name, value in changes.get(fields, {}).items():
+            setattr(record, name, value)
+    if "debt" in changes:
+        debt = {"lease": LeaseId("gone"), **DEBT, **changes["debt"]}
+        rest = {"key": "gone", "process": lease.process, "consumer": "a", "model": "a m"}
+        gone = Verification(**rest, **debt, retained_bytes=0, baseline=None, not_before=0.0)
+        gpu.verifications["gone"] = gone
+    assert admission.measured_room_bytes(gpu, changes.get("oldest", 90.0)) == room
+
+
+def test_a_gpu_that_grants_nothing_names_the_first_of_its_reasons() -> None:
+    scene = Scene()
+    core, gpu = state_of(scene.driver.arbiter), scene.gpu
+    loading = core.leases[scene.driver.consumer("a").acquire(1 * GIB)]
+    sample, gpu.sample = gpu.sample, None
+    core.serving, core.drain, gpu.failed_at, gpu.ledger.pressed = (
+        False,
+        Order("ops", "test"),
+        1.0,
+        True,
+    )
+    found = [core.blocked(gpu)]
+    for owner, name, value in (
+        (core, "serving", True),
+        (core, "drain", None),
+        (gpu, "failed_at", None),
+        (gpu, "sample", sample),
+        (gpu.residents, "by_state", {**gpu.residents.by_state, loading.state: {}}),
+        (gpu.ledger, "pressed", False),
+    ):
+        setattr(owner, name, value)
+        found.append(core.blocked(gpu))
+    assert found == [
+        Block.RECOVERING,
+        Block.DRAINED,
+        Block.UNREADABLE,
+        Block.UNREAD,
+        Block.LOADING,
+        Block.PRESSURE,
+        None,
+    ]
+
+
+@pytest.mark.parametrize(("more", "state"), [(0, "loading"), (1, "queued")])
+def test_the_last_byte_is_granted_and_no_more(more: int, state: str) -> None:
+    scene = Scene()
+    scene.hold("busy", 5)
+    scene.use("busy")
+    lease = scene.driver.consumer("w").acquire(3 * GIB + more, priority=10)
+    assert scene.driver.state(lease) == state
 
 
 def test_the_measured_need_is_less_by_what_the_process_holds() -> None:

@@ -7,6 +7,7 @@ import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.scenes import give_back
+from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import LeaseId, ProcessKey
 
@@ -202,13 +203,18 @@ def test_what_holders_will_give_back_is_waited_for_at_the_learned_bytes(driver: 
     assert driver.gpu()["charged_bytes"] == 6 * GIB
 
 
-def test_nothing_is_settled_below_the_declaration(driver: CoreDriver) -> None:
+@pytest.mark.parametrize(("more", "state"), [(0, "loading"), (1, "queued")])
+def test_nothing_is_settled_below_the_declaration(
+    driver: CoreDriver, more: int, state: str
+) -> None:
     greedy = learned(driver, 7.4)
     old, lease = held_after_peak(driver, "old", 2, residue_bytes=500 * MIB)
     give_back(driver, old, lease)
-    head = greedy.acquire(int(7.3 * GIB))
+    room = 8 * GIB - d.RESERVE_BYTES - 500 * MIB
+    head = greedy.acquire(room + more)
     driver.advance(2.0)
-    assert (driver.state(head), driver.view(head)["charge_bytes"]) == ("queued", int(7.4 * GIB))
+    charge = int(7.4 * GIB) if more else room
+    assert (driver.state(head), driver.view(head)["charge_bytes"]) == (state, charge)
     old.die()
     driver.until(lambda: driver.state(head) == "loading", limit_s=3.0)
 

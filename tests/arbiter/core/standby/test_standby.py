@@ -1,15 +1,20 @@
 """Standby: who was revoked comes back by itself when there is room, never at anybody's cost,
 or as soon as its holder wants it."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.engine_state import state_of
 from tests.support.scenes import give_back, held, in_use, revoked, sent_away, shown
+from vram_arbiter.arbiter.core import standby
 from vram_arbiter.arbiter.core.events import ProcessDied
+from vram_arbiter.arbiter.core.model.lease import Lease, LeaseState, Request, Standby
+from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
-from vram_arbiter.schemas.ids import LeaseId, ProcessKey
+from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 
 
 # -- there and back
@@ -128,16 +133,60 @@ def stay(driver: CoreDriver, gib: float) -> tuple[Consumer, LeaseId]:
     return held(driver, "stays", gib, evictable=False)
 
 
-def test_the_order_is_priority_then_who_left_first(driver: CoreDriver) -> None:
-    people = all_away(driver, 7, second=(2, {}), first=(2, {}), third=(2, {"priority": 60}))
-    back = []
-    for _ in people:
-        driver.until(lambda: any(driver.state(lease) == "loading" for _, lease in people.values()))
-        name = next(name for name, (_, lease) in people.items() if driver.state(lease) == "loading")
-        back.append(name)
-        person, lease = people[name]
-        person.load(lease)
-    assert back == ["third", "second", "first"]
+BUDGET = 8 * GIB - d.RESERVE_BYTES
+TURNS: dict[str, tuple[dict[str, Any], bool]] = {
+    "the older request": ({}, True),
+    "the later of two requests": ({"request": {"arrival": 9}}, False),
+    "away for less long": ({"standby": {"since": 5.1}}, False),
+    "a higher priority": ({"spec": {"priority": 51}, "standby": {"since": 5.1}}, True),
+    "a lower priority": ({"spec": {"priority": 49}}, False),
+    "wanted by its holder alone": ({"standby": {"comes_back": False}}, False),
+    "its holder is not back": ({"attached": False}, False),
+    "of another GPU": ({"request": {"gpus": ()}}, False),
+    "as large as the GPU": ({"request": {"load_peak_bytes": BUDGET}}, True),
+    "larger than the GPU": ({"request": {"load_peak_bytes": BUDGET + 1}}, False),
+    "left for one that is here": ({"standby": {"left_for": "stays"}}, False),
+    "left for another": ({"standby": {"left_for": "det"}}, True),
+}
+
+
+@pytest.mark.parametrize("case", TURNS)
+def test_whose_turn_it_is_to_come_back(driver: CoreDriver, case: str) -> None:
+    """Of two that are away, one is as in the case and the other is next."""
+    changes, first = TURNS[case]
+    core = state_of(driver.arbiter)
+    gpu = core.gpus[GpuId("GPU-0")]
+    if "left_for" in changes.get("standby", {}):
+        held(driver, "stays", 1)
+    found = []
+    for arrival, parts in ((7, changes), (8, {})):
+        person = driver.consumer(f"n{arrival}")
+        request = Request("n", 0.0, arrival, GIB, GIB, (gpu.info.id,))
+        away = Standby(comes_back=True, since=5.0)
+        lease = Lease(
+            LeaseId(person.name),
+            replace(person.spec(GIB), **parts.get("spec", {})),
+            person.process,
+            person.client,
+            replace(request, **parts.get("request", {})),
+            state=LeaseState.STANDBY,
+            attached=parts.get("attached", True),
+            standby=replace(away, **parts.get("standby", {})),
+        )
+        found.append(lease)
+    next_one = standby.first_to_return({lease.id: lease for lease in reversed(found)}, gpu)
+    assert next_one is found[0 if first else 1]
+
+
+@pytest.mark.parametrize(("changed_at", "since", "at"), [(7.0, 5.0, 9.0), (5.0, 7.0, 9.0)])
+def test_a_gpu_is_quiet_once_nothing_changed_for_the_residency(
+    driver: CoreDriver, changed_at: float, since: float, at: float
+) -> None:
+    _, lease = held(driver, "det", 1, min_residency_s=2.0)
+    core = state_of(driver.arbiter)
+    gpu, one = core.gpus[GpuId("GPU-0")], core.leases[lease]
+    gpu.changed_at, one.standby.since = changed_at, since
+    assert standby.quiet_at(gpu, one) == at
 
 
 def test_a_small_one_does_not_take_the_place_of_the_one_before_it(driver: CoreDriver) -> None:

@@ -8,6 +8,7 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.engine_state import state_of
 from tests.support.scenes import give_back, held
+from vram_arbiter.arbiter.core.events import ProcessDied
 from vram_arbiter.arbiter.core.model.lease import Verification
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
@@ -56,6 +57,11 @@ def expires(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
     driver.advance(view["ttl_left_s"])
 
 
+def expires_and_dies(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
+    expires(driver, det, lease)
+    driver.post(ProcessDied(det.process))
+
+
 def restarts(driver: CoreDriver, det: Consumer, lease: LeaseId) -> None:
     driver.restart(start=False)
 
@@ -88,6 +94,7 @@ UNSEEN = {"baseline": None, "baseline_comparable": False}
         (exits, 0.0, {**DEAD, "alive": True}),
         (dies, 0.0, DEAD),
         (expires, GRACE_S, LIVES | FENCED),
+        (expires_and_dies, 0.0, DEAD | FENCED | {"deadline_at": GRACE_S + d.VERIFY_TIMEOUT_S}),
         (leaves_and_restarts, 0.0, LIVES | UNSEEN),
         (expires_and_restarts, GRACE_S, LIVES | UNSEEN | {"fenced_at": TTL_S + GRACE_S}),
         (restarts_and_expires, 0.0, LIVES | {"fenced_at": 0.0}),
@@ -99,14 +106,14 @@ def test_what_a_holder_declared_may_stay_only_while_it_lives(
     grace_s: float,
     expected: dict[str, Any],
 ) -> None:
-    """`expected`: `fenced_at` is in seconds from now; otherwise there is none."""
+    """`fenced_at` and `deadline_at` are in seconds from now."""
     det, lease = held(driver, "det", 5, residue_bytes=RESIDUE_BYTES, exclusive=True, ttl_s=TTL_S)
     driver.advance(1.0)
     driver.device.lag_s = 1.0
     how(driver, det, lease)
     at = driver.now
     found = under_way(driver)
-    fenced = {"fenced_at": at + expected["fenced_at"]} if "fenced_at" in expected else {}
+    moments = {key: at + expected[key] for key in ("fenced_at", "deadline_at") if key in expected}
     assert found == begun(
         **{
             "at": at,
@@ -120,7 +127,7 @@ def test_what_a_holder_declared_may_stay_only_while_it_lives(
             "baseline_comparable": True,
             "exclusive": True,
             **expected,
-            **fenced,
+            **moments,
         }
     )
     assert found.baseline is None or found.baseline.used_bytes == 5 * GIB

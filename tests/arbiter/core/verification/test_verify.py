@@ -1,17 +1,24 @@
 """Verdicts. The bytes of a lease stay charged until a reading says that they came back, or whose
 they are."""
 
-import itertools
+from dataclasses import replace
 
 import pytest
 
 from tests.support.core_driver import READING_S, CoreDriver
+from tests.support.engine_state import state_of
 from tests.support.scenes import give_back, held, verdicts
-from vram_arbiter.arbiter.core.effects import Sample
-from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed, Tick
+from vram_arbiter.arbiter.core.effects import Note, Sample
+from vram_arbiter.arbiter.core.events import MemorySampled, ProbeFailed, Resumed
+from vram_arbiter.arbiter.core.learning import Costs
+from vram_arbiter.arbiter.core.model.gpu import Gpu
+from vram_arbiter.arbiter.core.model.lease import Verification
+from vram_arbiter.arbiter.core.model.state import Core
+from vram_arbiter.arbiter.core.verification import schedule
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import GpuId, ProcessKey
+from vram_arbiter.schemas.wire.notes import About, VerifiedNote
 
 STRANGER = ProcessKey(9, 9)
 GPU = GpuId("GPU-0")
@@ -40,14 +47,6 @@ def test_two_equal_readings_after_the_release_are_enough(driver: CoreDriver) -> 
     assert driver.gpu()["charged_bytes"] == 450 * MIB
 
 
-def pauses(driver: CoreDriver, began: float) -> list[float]:
-    """Milliseconds between the readings that were asked for by a timer since then."""
-    ticks = [at for at, event in driver.events if isinstance(event, Tick) and at >= began]
-    return [
-        round(1e3 * (later - sooner), 3) for sooner, later in itertools.pairwise([began, *ticks])
-    ]
-
-
 @pytest.mark.parametrize("lag_s", [0.0, 0.001, 0.25, 0.7, 1.5, 1.99])
 def test_memory_that_comes_back_is_noticed_within_ten_milliseconds(lag_s: float) -> None:
     driver = CoreDriver(8 * GIB)
@@ -58,45 +57,86 @@ def test_memory_that_comes_back_is_noticed_within_ten_milliseconds(lag_s: float)
     assert lag_s < took <= lag_s + 0.010 + 2 * READING_S
 
 
-def test_readings_are_dense_while_memory_usually_comes_back_and_rarer_later() -> None:
-    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
-    driver.device.lag_s = 7.0
+def under_way(driver: CoreDriver) -> tuple[Core, Gpu, Verification]:
+    """A verification whose reading does not come, and its next poll is due now."""
+    driver.device.silent = True
+    core = state_of(driver.arbiter)
+    gpu = core.gpus[GPU]
+    (one,) = gpu.verifications.values()
+    one.next_poll_at, one.last_used_bytes = core.now, 0
+    gpu.asked_at, gpu.dirty = None, False
+    return core, gpu, one
+
+
+@pytest.mark.parametrize(
+    ("waited_s", "usual_s", "reading_s", "left_s", "pause_s"),
+    [
+        # dense for 2 s, then for 3 s less
+        (0.0, 0.0, 0.001, 9.0, 0.005),
+        (1.999, 0.0, 0.001, 9.0, 0.005),
+        (2.0, 0.0, 0.001, 9.0, 0.020),
+        (4.999, 0.0, 0.001, 9.0, 0.020),
+        (5.0, 0.0, 0.001, 9.0, 0.050),
+        # for half as long again as it usually takes
+        (2.999, 2.0, 0.001, 9.0, 0.005),
+        (3.0, 2.0, 0.001, 9.0, 0.020),
+        (5.999, 4.0, 0.001, 9.0, 0.005),
+        (6.0, 4.0, 0.001, 9.0, 0.050),
+        # half of the time at most, and twice a second at least
+        (0.0, 0.0, 0.025, 9.0, 0.050),
+        (6.0, 0.0, 0.025, 9.0, 0.050),
+        (0.0, 0.0, 3.0, 9.0, 0.500),
+        # at the deadline, and rarely after it
+        (6.0, 0.0, 0.001, 0.030, 0.030),
+        (6.0, 0.0, 0.001, 0.004, 0.005),
+        (0.0, 0.0, 0.001, 0.001, 0.005),
+        (0.0, 0.0, 0.001, 0.0, 0.500),
+        (9.0, 4.0, 0.025, -1.0, 0.500),
+    ],
+)
+def test_readings_are_dense_while_memory_usually_comes_back_and_rarer_later(
+    driver: CoreDriver,
+    waited_s: float,
+    usual_s: float,
+    reading_s: float,
+    left_s: float,
+    pause_s: float,
+) -> None:
     det, lease = held(driver, "det", 5)
-    driver.advance(0.1)  # the last of the readings that follow a load
     det.unload(lease)
-    began = driver.now
-    driver.until(lambda: driver.state(lease) == "over")
-    seen = pauses(driver, began)
-    assert (seen[0], set(seen[1:390])) == (2.0, {5.0}), "for 2 s"
-    assert set(seen[405:545]) == {20.0}, "for 3 s more"
-    assert set(seen[560:-1]) == {50.0}, "then until the verdict"
-    assert seen[-1] == pytest.approx(2.0), "but for the second reading that has to agree"
-    assert len(seen) < 620
+    core, gpu, one = under_way(driver)
+    one.paced_from, one.deadline_at = core.now - waited_s, core.now + left_s
+    gpu.reading_s = reading_s
+    core.costs = Costs({"det": {"verify_s": usual_s}} if usual_s else {}, 30.0)
+    schedule.on_poll_due(core, GPU)
+    assert one.next_poll_at - core.now == pytest.approx(pause_s)
+    assert (one.overdue, gpu.dirty) == (left_s <= 0, left_s <= 0)
+    assert (gpu.asked_at, core.readings, core.turn.effects) == (core.now, [GPU], [])
 
 
-def test_a_consumer_that_is_known_to_take_longer_is_looked_at_densely_for_longer() -> None:
-    driver = CoreDriver(
-        8 * GIB, settings={"learnt": {"det": {"verify_s": 4.0}}, "probe_period_s": 1000.0}
-    )
-    driver.device.lag_s = 4.2
+def test_a_poll_that_was_put_off_reads_nothing(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
-    driver.advance(0.1)
     det.unload(lease)
-    began = driver.now
-    took = driver.until(lambda: driver.state(lease) == "over", step_s=0.001)
-    assert 4.2 < took <= 4.212
-    assert set(pauses(driver, began)[1:-1]) == {5.0}, "for half as long again as it took before"
+    core, gpu, one = under_way(driver)
+    one.next_poll_at += 0.001
+    before = one.next_poll_at
+    gpu.touched = False
+    schedule.on_poll_due(core, GPU)
+    assert (one.next_poll_at, gpu.asked_at, gpu.touched) == (before, None, True)
 
 
-def test_a_gpu_that_is_slow_to_read_is_not_read_all_the_time() -> None:
-    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 1000.0})
-    driver.device.lag_s, driver.device.reading_s = 1.0, 0.025
+def test_a_deadline_without_a_reading_is_stale(driver: CoreDriver) -> None:
+    """It is said once, and the poll that follows says nothing more."""
     det, lease = held(driver, "det", 5)
-    driver.advance(0.1)
     det.unload(lease)
-    began = driver.now
-    driver.until(lambda: driver.state(lease) == "over")
-    assert set(pauses(driver, began)[2:-2]) == {50.0}, "half of the time at most"
+    core, _, one = under_way(driver)
+    one.last_used_bytes, one.deadline_at = None, core.now
+    core.now += 1.0
+    for _ in range(2):
+        schedule.on_poll_due(core, GPU)
+        one.next_poll_at = core.now
+    stale = VerifiedNote("stale", False, pytest.approx(1000.0), 5 * GIB, None, 0, ())
+    assert core.turn.effects == [Note(stale, About(lease, "det", GPU))]
 
 
 def test_readings_do_not_pile_up_where_one_takes_longer_than_the_pause() -> None:
@@ -108,6 +148,65 @@ def test_readings_do_not_pile_up_where_one_takes_longer_than_the_pause() -> None
     driver.advance(0.029)
     asked = [effect for effect in driver.effects[before:] if isinstance(effect, Sample)]
     assert len(asked) == 1, "that of the release is still under way, and counts"
+
+
+@pytest.mark.parametrize(("later_s", "counts"), [(-0.001, False), (0.0, True), (0.001, True)])
+@pytest.mark.parametrize("after", ["another reading", "a suspend"])
+def test_a_reading_that_began_before_the_newest_or_a_suspend_does_not_count(
+    driver: CoreDriver, after: str, later_s: float, counts: bool
+) -> None:
+    driver.device.silent = True
+    gpu = state_of(driver.arbiter).gpus[GPU]
+    driver.advance(0.1)
+    if after == "a suspend":
+        driver.post(Resumed(60.0))
+        since = driver.now
+    else:
+        assert gpu.sample is not None
+        since = gpu.sample.taken_at
+    driver.now += 0.1
+    reading = MemorySampled(GPU, since + later_s, 0, 8 * GIB, ())
+    driver.post(reading)
+    assert (gpu.sample is reading) == counts
+
+
+@pytest.mark.parametrize(("later_s", "asked"), [(-0.001, True), (0.0, False), (0.2, False)])
+def test_a_reading_answers_what_was_asked_before_it_began(
+    driver: CoreDriver, later_s: float, asked: bool
+) -> None:
+    core = state_of(driver.arbiter)
+    gpu = core.gpus[GPU]
+    gpu.asked_at = core.now + 0.1
+    reading = MemorySampled(GPU, gpu.asked_at + later_s, 0, 8 * GIB, ())
+    core.now += 0.2
+    schedule.on_reading(core, reading)
+    assert gpu.sample is reading
+    assert (gpu.asked_at is not None) == asked
+    assert gpu.reading_s == pytest.approx(max(0.0, 0.1 - later_s))
+
+
+@pytest.mark.parametrize(
+    ("sample_s", "failed_s", "stale"),
+    [
+        (2.0, None, False),
+        (2.001, None, True),
+        (2.001, 2.0, False),
+        (2.001, 2.001, True),
+        (2.0, 2.001, False),
+        (None, None, True),
+        (None, 2.0, False),
+    ],
+)
+def test_a_gpu_is_stale_when_its_newest_reading_may_gate_no_grant(
+    driver: CoreDriver, sample_s: float | None, failed_s: float | None, stale: bool
+) -> None:
+    """A failed reading is news as well. `sample_s`, `failed_s`: their age."""
+    gpu = state_of(driver.arbiter).gpus[GPU]
+    assert gpu.sample is not None
+    now = driver.now + 100.0
+    gpu.sample = None if sample_s is None else replace(gpu.sample, taken_at=now - sample_s)
+    gpu.failed_at = None if failed_s is None else now - failed_s
+    assert driver.arbiter.stale(now) == ([GPU] if stale else [])
 
 
 def test_no_reading_from_before_the_release_counts() -> None:
