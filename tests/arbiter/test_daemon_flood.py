@@ -33,7 +33,6 @@ def flooded(arbiter_daemon: ArbiterProcess) -> Iterator[ArbiterProcess]:
         stdout=subprocess.PIPE,
     )
     try:
-        assert flooder.stdout is not None
         assert flooder.stdout.readline()
         yield arbiter_daemon
     finally:

@@ -264,7 +264,6 @@ class Stage:
         )
         await self.detector.load()  # the arbiter's word is a moment ahead of the sidecar's
         (shown,) = (await self.arbiter.status()).leases
-        assert shown.token is not None
         token = [shown.token.epoch, shown.token.serial]
         assert (await self.detector.ping(timeout_s=WAIT_S))["token"] == token
         assert await self.leases() == {"detector": "held"}

@@ -161,7 +161,6 @@ class Machine:
                 self.inside("/opt/vram-arbiter/bin/python", "-c", code),
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
             )  # fmt: skip
-        assert self._answering.stdin is not None
         assert self._answering.stdout is not None
         self._answering.stdin.write(f"{line}\n")
         return json.loads(self._answering.stdout.readline())

@@ -56,7 +56,6 @@ async def attacked(endpoint: str, mode: str) -> AsyncIterator[None]:
     attacker = await asyncio.create_subprocess_exec(
         sys.executable, str(ATTACKER), mode, path, stdout=subprocess.PIPE
     )
-    assert attacker.stdout is not None
     try:
         assert await attacker.stdout.readline() == b"under way\n"
         yield

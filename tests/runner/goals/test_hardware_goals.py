@@ -55,7 +55,6 @@ class Told(Nod):
 
     def _wait(self, world: WorldState) -> None:
         if self.prompt == "hang in the step":
-            assert self._loop is not None
             self._loop.call_soon_threadsafe(self.begun.set)
             self.go_on.wait(60)
 

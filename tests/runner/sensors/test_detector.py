@@ -117,7 +117,6 @@ def detector(
 def detections_of(hardware: HardwareRunner) -> tuple[list[str], str]:
     """What a tick sees: labels, and the diagnostics of the detector."""
     hardware.tick()
-    assert hardware.world is not None
     labels = [one.label for one in hardware.world.detected_objects]
     return labels, hardware.world.diagnostics["detector:front"]
 
@@ -128,7 +127,6 @@ async def test_detections_are_in_the_world_state_until_old(
     assert detections_of(hardware) == ([], "stale")  # it has not looked yet
     await detector.look()
     assert detections_of(hardware) == (["red cube"], "ok")
-    assert hardware.world is not None
     (cube,) = hardware.world.detected_objects
     assert (cube.box, cube.sensor_id, cube.confidence) == ((1.0, 2.0, 3.0, 4.0), "front", 0.9)
     assert cube.stamp_ns == clock.now_ns()  # when its picture was taken

@@ -79,7 +79,6 @@ def test_the_world_state_has_both_pictures_of_a_moment_or_none(clock: ManualCloc
         clock.advance(0.004)
         front.show()
         runner.tick()
-        assert runner.world is not None
         frames = (runner.world.image_frames or {}).values()
         return sorted(frame.stamp_monotonic_ns for frame in frames)
 
@@ -90,6 +89,5 @@ def test_the_world_state_has_both_pictures_of_a_moment_or_none(clock: ManualCloc
         clock.advance(0.034)
         front.show()
         runner.tick()
-    assert runner.world is not None
     assert runner.world.stale == ("front", "wrist")
     runner.deactivate()
