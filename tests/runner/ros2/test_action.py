@@ -28,12 +28,14 @@ from cyclonedds.idl.types import float64, uint16  # noqa: E402
 from tests.runner.ros2.independent import (  # noqa: E402
     CancelRequest_,
     CancelResponse_,
+    Quaternion_,
     Time_,
     action_of,
     server_of,
     struct,
     valid,
 )
+from tests.runner.sensors.ros2_node import Header_  # noqa: E402
 
 DOMAIN = 80
 PREFIX = "nav2_msgs.action.dds_.NavigateToPose_"
@@ -41,11 +43,7 @@ WORLD = WorldState(stamp_ns=0, joint_state=JointState(name=(), position=(), stam
 PATIENCE_S = 60.0
 
 
-Header_ = struct("std_msgs.msg.dds_.Header_", stamp=Time_, frame_id=str)
 Point_ = struct("geometry_msgs.msg.dds_.Point_", x=float64, y=float64, z=float64)
-Quaternion_ = struct(
-    "geometry_msgs.msg.dds_.Quaternion_", x=float64, y=float64, z=float64, w=float64
-)
 Pose_ = struct("geometry_msgs.msg.dds_.Pose_", position=Point_, orientation=Quaternion_)
 PoseStamped_ = struct("geometry_msgs.msg.dds_.PoseStamped_", header=Header_, pose=Pose_)
 Goal_ = struct("nav2_msgs.action.dds_.NavigateToPose_Goal_", pose=PoseStamped_, behavior_tree=str)

@@ -27,7 +27,7 @@ from cyclonedds.sub import DataReader  # noqa: E402
 from cyclonedds.topic import Topic  # noqa: E402
 from cyclonedds.util import duration  # noqa: E402
 
-from tests.runner.ros2.independent import struct, valid  # noqa: E402
+from tests.runner.ros2.independent import Transform_, struct, valid  # noqa: E402
 from tests.runner.sensors.ros2_node import Header_  # noqa: E402
 
 PATIENCE_S = 60.0
@@ -39,11 +39,6 @@ JointState_ = struct(
     velocity=sequence[float64],
     effort=sequence[float64],
 )
-Vector3_ = struct("geometry_msgs.msg.dds_.Vector3_", x=float64, y=float64, z=float64)
-Quaternion_ = struct(
-    "geometry_msgs.msg.dds_.Quaternion_", x=float64, y=float64, z=float64, w=float64
-)
-Transform_ = struct("geometry_msgs.msg.dds_.Transform_", translation=Vector3_, rotation=Quaternion_)
 Stamped_ = struct(
     "geometry_msgs.msg.dds_.TransformStamped_",
     header=Header_,
