@@ -43,13 +43,13 @@ def requests_under(attack: str, seconds: float) -> list[float]:
     """A ping and an acquire + release in turns, each timed."""
     samples = []
     with arbiter(SHIPPED) as daemon:
-        peer = Peer(daemon.endpoint, "calm").hello()
+        peer = Peer(daemon.endpoint, "calm").greeted()
         with attacked(daemon.endpoint, attack, seconds):
             end_s = time.monotonic() + seconds
             while time.monotonic() < end_s:
                 pause(CALM_PAUSE_S)
                 samples.append(elapsed_us(lambda: peer.ask("ping")))
                 pause(CALM_PAUSE_S)
-                samples.append(elapsed_us(lambda: peer.release(peer.acquire())))
+                samples.append(elapsed_us(lambda: peer.release(peer.lease())))
         peer.close()
     return samples

@@ -87,7 +87,7 @@ def test_one_that_never_reads_loses_its_answers_and_costs_nobody_else(
         honest.arbiter,
         """
 client = WireClient(endpoint).hello("deaf")
-client._socket.setsockopt(zmq.SNDTIMEO, 200)
+client.socket.setsockopt(zmq.SNDTIMEO, 200)
 assert client.ask("subscribe")["ok"]
 frame = msgpack.packb({"op": "status", "id": 1})
 sent = 0
