@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, Nod, Twin, moving
+from tests.runner.small_robots import FedCamera, Nod, Twin, moving, twin_runner
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.skill_slot import WITHHELD_IN_A_ROW_MAX
 from vram_arbiter.runner.protocols import DeadlinePolicy, Goal, Hold, SafetyGate, Skill, SkillEnded
@@ -19,9 +19,7 @@ from vram_arbiter.runner.robots.hardware import (
     FIRST_DATA_SLICE_S,
     FIRST_STATE_TRIES,
     HardwareRunner,
-    hardware_runner,
 )
-from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.sensors import Feed
@@ -46,12 +44,6 @@ PERIOD_S = 1 / 30
 MakeRunner = Callable[..., HardwareRunner]
 
 
-def gate(skill: Skill) -> SafetyGate:
-    return JointRanges(
-        {joint.name: (joint.lower_rad, joint.upper_rad) for joint in so101(simulated=True).joints}
-    )
-
-
 @pytest.fixture
 def twin(clock: Any) -> Twin:
     return Twin(clock)
@@ -65,10 +57,7 @@ def front(clock: Any) -> FedCamera:
 @pytest.fixture
 def make_runner(clock: Any, twin: Twin) -> MakeRunner:
     def build(cameras: Sequence[FedCamera] = (), **options: Any) -> HardwareRunner:
-        readers = [(camera, 100.0) for camera in cameras]
-        return hardware_runner(
-            twin, readers, options.pop("make_gate", gate), clock=clock, **options
-        )
+        return twin_runner(twin, *cameras, clock=clock, **options)
 
     return build
 
@@ -462,7 +451,7 @@ def test_it_starts_on_a_camera_whose_pictures_take_their_time() -> None:
     clock, over = SystemClock(), threading.Event()
     twin = Twin(clock)
     far = Distant("far", clock, 60_000.0, always=False)
-    runner = hardware_runner(twin, [(far, 60_000.0)], gate, clock=clock, first_data_s=50.0)
+    runner = twin_runner(twin, far, clock=clock, max_age_ms=60_000.0, first_data_s=50.0)
 
     def film() -> None:
         while not over.wait(0.01):
@@ -506,7 +495,7 @@ def test_it_waits_for_a_camera_that_another_program_has_not_started(twin: Twin) 
     """
     clock = ManualClock()
     camera = Later("front", clock, always=False)
-    runner = hardware_runner(twin, [(camera, 100.0)], gate, clock=clock, first_data_s=15.0)
+    runner = twin_runner(twin, camera, clock=clock, first_data_s=15.0)
     runner.activate()
     assert camera.looks == 10
     assert twin.story == ["connect"]

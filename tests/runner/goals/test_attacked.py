@@ -2,23 +2,20 @@
 loop ticks, and a stop is answered.
 """
 
-import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
 
-from tests.runner.small_robots import FedCamera, Nod, Twin
+from tests.runner.goal_bench import goals_served
+from tests.runner.small_robots import FedCamera, Nod, Twin, twin_runner
 from tests.support.attacks import WITHOUT_A_SESSION
 from tests.support.running import attacked
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.control.clock import SystemClock
-from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
-from vram_arbiter.runner.goals.server import GoalServer
-from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
-from vram_arbiter.runner.safety.ranges import JointRanges
+from vram_arbiter.runner.robots.hardware import HardwareRunner
 from vram_arbiter.schemas.errors import EstopRequested
 from vram_arbiter.schemas.manifest import Kind, load_manifest
 
@@ -32,20 +29,10 @@ async def hardware_serving(endpoint: str, manifest: Path) -> AsyncIterator[Hardw
     clock = SystemClock()
     twin, camera = Twin(clock), FedCamera("front", clock)
     skill = Nod(load_manifest(manifest), steps=20)
-    limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
-    runner = hardware_runner(
-        twin, [(camera, 60_000.0)], lambda _: JointRanges(limits), rate_hz=100.0, clock=clock
-    )
+    runner = twin_runner(twin, camera, clock=clock, max_age_ms=60_000.0, rate_hz=100.0)
     catalogue = Catalogue([skill.manifest], {Kind.ROS_ACTION: lambda _: skill})
-    async with ControlThread(runner) as control:
-        server = GoalServer(endpoint, control, catalogue, clock, estop_s=60.0)
-        task = asyncio.create_task(server.serve())
-        await server.bound.wait()
-        try:
-            yield runner
-        finally:
-            server.stopping.set()
-            await task
+    async with goals_served(endpoint, runner, catalogue):
+        yield runner
 
 
 @pytest.mark.parametrize("attack", WITHOUT_A_SESSION)

@@ -11,11 +11,10 @@ from typing import Any
 import pytest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, Twin
+from tests.runner.small_robots import FedCamera, Twin, twin_runner
 from vram_arbiter.clients.net.server import RouterServer
 from vram_arbiter.clients.sidecar.perception import DetectorClient
-from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
-from vram_arbiter.runner.safety.ranges import JointRanges
+from vram_arbiter.runner.robots.hardware import HardwareRunner
 from vram_arbiter.runner.sensors.detections import DetectionSlot
 from vram_arbiter.runner.sensors.detector import ContinuousDetector
 from vram_arbiter.schemas.config.robot import DetectorConfig
@@ -92,12 +91,8 @@ def camera(clock: ManualClock) -> FedCamera:
 
 @pytest.fixture
 def hardware(clock: ManualClock, camera: FedCamera) -> Iterator[HardwareRunner]:
-    hardware = hardware_runner(
-        Twin(clock),
-        [(camera, 100.0)],
-        lambda skill: JointRanges({}),
-        clock=clock,
-        detections=[DetectionSlot("front", 1000.0)],
+    hardware = twin_runner(
+        Twin(clock), camera, clock=clock, detections=[DetectionSlot("front", 1000.0)]
     )
     hardware.activate()
     yield hardware

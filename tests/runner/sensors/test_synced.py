@@ -3,10 +3,8 @@
 import pytest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, Twin, frame_at
+from tests.runner.small_robots import FedCamera, Twin, frame_at, twin_runner
 from tests.support.waiting import until
-from vram_arbiter.runner.robots.hardware import hardware_runner
-from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.sensors.synced import read_together
 from vram_arbiter.schemas.config.robot import SyncConfig
 from vram_arbiter.schemas.errors import FrameStale
@@ -63,13 +61,8 @@ def test_cameras_that_never_meet_are_refused_with_their_distance() -> None:
 
 def test_the_world_state_has_both_pictures_of_a_moment_or_none(clock: ManualClock) -> None:
     front, wrist = FedCamera("front", clock), FedCamera("wrist", clock)
-    runner = hardware_runner(
-        Twin(clock),
-        [(front, 100.0), (wrist, 100.0)],
-        lambda skill: JointRanges({}),
-        clock=clock,
-        sync=SyncConfig(sensor_ids=("front", "wrist"), max_spread_ms=5.0),
-    )
+    sync = SyncConfig(sensor_ids=("front", "wrist"), max_spread_ms=5.0)
+    runner = twin_runner(Twin(clock), front, wrist, clock=clock, sync=sync)
     runner.activate()
     front.always = wrist.always = False
 
