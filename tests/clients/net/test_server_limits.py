@@ -20,6 +20,7 @@ import zmq
 import zmq.asyncio
 
 from tests.support.prepared import run
+from tests.support.serving import serving
 from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.net.server import (
     IMAGES_MAX_BYTES,
@@ -61,15 +62,13 @@ class Server:
 
 @asynccontextmanager
 async def router_at(path: Path, **options: Any) -> AsyncIterator[Server]:
-    async with RouterServer(f"ipc://{path}", refused, **options) as router:
-        server = Server(router)
-        task = asyncio.create_task(router.serve(server.handle))
+    router = RouterServer(f"ipc://{path}", refused, **options)
+    server = Server(router)
+    async with serving(router, server.handle):
         try:
             yield server
         finally:
             server.go_on.set()
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
 
 
 class Client:

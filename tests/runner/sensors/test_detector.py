@@ -2,8 +2,6 @@
 evicted, back. The model is the test's; time moves only when told.
 """
 
-import asyncio
-import contextlib
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ import pytest
 
 from tests.runner.manual_clock import ManualClock
 from tests.runner.small_robots import FedCamera, Twin, twin_runner
+from tests.support.serving import serving
 from vram_arbiter.clients.net.server import RouterServer
 from vram_arbiter.clients.sidecar.perception import DetectorClient
 from vram_arbiter.runner.robots.hardware import HardwareRunner
@@ -75,13 +74,12 @@ def model(clock: ManualClock) -> Model:
 @pytest.fixture
 async def client(short_folder: Path, model: Any) -> AsyncIterator[DetectorClient]:
     endpoint = f"ipc://{short_folder}/d.sock"
-    async with RouterServer(endpoint, unread_reply(model.model_ops)) as server:
-        serving = asyncio.create_task(server.serve(Wire(model, server.send).handle))
-        async with DetectorClient(endpoint) as client:
-            yield client
-        serving.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await serving
+    server = RouterServer(endpoint, unread_reply(model.model_ops))
+    async with (
+        serving(server, Wire(model, server.send).handle),
+        DetectorClient(endpoint) as client,
+    ):
+        yield client
 
 
 @pytest.fixture
