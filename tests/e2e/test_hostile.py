@@ -17,11 +17,11 @@ import pytest
 from tests.support.honest import Honest
 from tests.support.hostile import BOMBS, Forger
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 GIB, MIB = 1 << 30, 1 << 20
-PATIENCE_S = 60.0
 LARGE_BYTES = 8192
 ATTACKER = """
 import json, msgpack, os, sys, zmq

@@ -21,15 +21,15 @@ from typing import Any
 import pytest
 
 from tests.support.children import spawn
+from tests.support.paths import ROOT
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from tests.support.wire import WireClient
+from vram_arbiter.schemas.defaults import GIB
 
 pytestmark = pytest.mark.e2e
-PATIENCE_S = 60
-GIB = 1 << 30
 NOBODYS_GID = 1  # `daemon` or `bin`, which no user is in
-TREE = Path(__file__).parents[2]
-UNIT = TREE / "configs" / "systemd" / "system" / "vram-arbiter.service"
+UNIT = ROOT / "configs" / "systemd" / "system" / "vram-arbiter.service"
 
 
 class Service(ArbiterProcess):

@@ -14,13 +14,12 @@ import pytest
 from tests.support.attacks import WITHOUT_A_SESSION
 from tests.support.paths import ROOT
 from tests.support.running import attacked
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 
 MB = 10**6
-PATIENCE_S = 60.0
 
 
 def test_without_an_arbiter_models_stay_and_the_last_one_does_not_fit(lone_box):

@@ -19,6 +19,7 @@ import msgpack
 import pytest
 
 from tests.support.fakegpu_check import check_log
+from tests.support.paths import CONFIGS
 from tests.support.pictures import encoded
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
@@ -34,7 +35,6 @@ pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(400)]
 
 PATIENCE_S = 180.0
 GB = 10**9
-CONFIGS = Path(__file__).parents[2] / "configs"
 type Message = dict[str, Any]
 
 

@@ -19,6 +19,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from tests.runner.sensors.ros2_node import Time_, struct
+from tests.support.waiting import PATIENCE_S
 
 QUALITY = Qos(
     Policy.Reliability.Reliable(duration(seconds=10)),
@@ -26,7 +27,6 @@ QUALITY = Qos(
     Policy.DataRepresentation(use_cdrv0_representation=True),
 )
 """ROS 2's of services."""
-PATIENCE_S = 60.0
 LATCHED = Qos(
     Policy.Reliability.Reliable(duration(seconds=10)),
     Policy.Durability.TransientLocal,

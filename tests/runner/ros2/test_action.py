@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from tests.support.dds import NETWORK
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.runner.protocols import Done, Goal, Hold
 from vram_arbiter.runner.ros2.served_skills import RosAction
 from vram_arbiter.runner.sensors.ros2_types import read, write
@@ -40,7 +41,6 @@ from tests.runner.sensors.ros2_node import Header_  # noqa: E402
 DOMAIN = 80
 PREFIX = "nav2_msgs.action.dds_.NavigateToPose_"
 WORLD = WorldState(stamp_ns=0, joint_state=JointState(name=(), position=(), stamp_ns=0))
-PATIENCE_S = 60.0
 
 
 Point_ = struct("geometry_msgs.msg.dds_.Point_", x=float64, y=float64, z=float64)

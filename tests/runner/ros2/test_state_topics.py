@@ -12,6 +12,7 @@ import pytest
 
 from tests.runner.goal_bench import goal_bench
 from tests.support.dds import NETWORK
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.planar import planar_pose
 from vram_arbiter.runner.ros2.state_topics import StateTopics
@@ -30,7 +31,6 @@ from cyclonedds.util import duration  # noqa: E402
 from tests.runner.ros2.independent import Transform_, struct, valid  # noqa: E402
 from tests.runner.sensors.ros2_node import Header_  # noqa: E402
 
-PATIENCE_S = 60.0
 JointState_ = struct(
     "sensor_msgs.msg.dds_.JointState_",
     header=Header_,

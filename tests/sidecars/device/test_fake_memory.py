@@ -12,13 +12,11 @@ import pytest
 
 from tests.support.fakegpu_check import check_log
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_gpu
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.errors import NoGpu, OutOfMemory
 from vram_arbiter.schemas.fakegpu import SimulatedOutOfMemory
 from vram_arbiter.sidecars.device.fake import FakeMemory
 from vram_arbiter.sidecars.device.memory import DeviceMemory, fill
-
-MIB = 2**20
-GIB = 2**30
 
 CONTENDER = """
 import random, sys
