@@ -97,7 +97,6 @@ class Suite:
         at_most: float | None,
         *,
         of: Callable[[Sequence[float]], float] | None = None,
-        note: str | None = None,
     ) -> None:
         """A row that may be so many times its floor: by the median, or by what `of` takes
         of both."""
@@ -114,7 +113,6 @@ class Suite:
             target,
             ok,
             against=against,
-            note=note,
         )
         self.rows.append(row)
 

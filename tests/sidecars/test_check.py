@@ -215,9 +215,9 @@ DETECTOR = (
 )
 
 
-def put_into_cache(hub: Path, repository: str = "test/model") -> Path:
+def put_into_cache(hub: Path) -> Path:
     """Lay a snapshot into the hub's cache as a download does; return its folder."""
-    place = hub / f"models--{repository.replace('/', '--')}"
+    place = hub / "models--test--model"
     folder = place / "snapshots" / "0123"
     folder.mkdir(parents=True)
     (place / "refs").mkdir()

@@ -78,11 +78,11 @@ def used(gpu_folder):
     return probe.sample(probe.gpus()[0].id).used_bytes
 
 
-def seconds_until(condition, deadline_s=60.0):
+def seconds_until(condition):
     """Wait until a condition on the GPU's files holds; returns how long it took."""
     began, pause = time.monotonic(), threading.Event()
     while not condition():
-        assert time.monotonic() < began + deadline_s, "it did not happen in time"
+        assert time.monotonic() < began + 60.0, "it did not happen in time"
         pause.wait(0.005)
     return time.monotonic() - began
 
