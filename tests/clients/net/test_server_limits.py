@@ -21,7 +21,7 @@ import zmq.asyncio
 
 from tests.support.prepared import run
 from tests.support.serving import serving
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, eventually
 from vram_arbiter.clients.net.server import (
     IMAGES_MAX_BYTES,
     WAITING_MAX,
@@ -245,8 +245,7 @@ def test_a_deleted_socket_file_is_made_again(tmp_path: Path) -> None:
         path = tmp_path / "s.sock"
         async with router_at(path):
             path.unlink()
-            while not path.exists():
-                await asyncio.sleep(0.01)
+            await eventually(path.exists)
             client = Client(path)
             assert (await client.ask({"op": "ping", "id": 1}))["ok"]
             client.close()

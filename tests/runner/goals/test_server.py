@@ -15,6 +15,7 @@ import zmq
 import zmq.asyncio
 
 from tests.runner.goal_bench import RSKILL, Bench, Told, goal_bench
+from tests.support.waiting import eventually
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.goals.catalogue import Catalogue, read_manifests
@@ -162,8 +163,7 @@ async def test_a_skill_that_breaks_while_it_finishes_still_gives_a_result(
 @pytest.mark.parametrize("prompt", ["forever", "hang"])
 async def test_cancel_takes_the_arm_back(b: Bench, client: RunnerClient, prompt: str) -> None:
     goal = await client.send_goal(RSKILL, prompt=prompt)
-    while not b.made or not b.made[0].begun.is_set():
-        await asyncio.sleep(0.01)
+    await eventually(lambda: b.made and b.made[0].begun.is_set())
     await goal.cancel()
     result = await goal.result(60)
     assert (result["status"], result["success"]) == ("canceled", False)

@@ -12,7 +12,7 @@ import pytest
 
 from tests.runner.goal_bench import goal_bench
 from tests.support.dds import NETWORK
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, eventually
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.planar import planar_pose
 from vram_arbiter.runner.ros2.state_topics import StateTopics
@@ -115,9 +115,8 @@ def robot() -> Robot:
 
 async def read(topics: StateTopics, name: str) -> None:
     """Wait until a topic's writer has a reader."""
-    async with asyncio.timeout(PATIENCE_S):
-        while not topics._writers[name].get_publication_matched_status().current_count:
-            await asyncio.sleep(0.01)
+    writer = topics._writers[name]
+    await eventually(lambda: writer.get_publication_matched_status().current_count)
 
 
 async def test_a_state_is_published_once_and_never_when_it_is_stale(

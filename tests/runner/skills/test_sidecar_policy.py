@@ -16,6 +16,7 @@ from tests.runner.skills.policy_bench import JOINTS, MANIFEST, REST, Arbiter, Be
 from tests.runner.small_robots import robot_of
 from tests.support.field_server import FieldServer
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import eventually
 from tests.support.wire import WireClient
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.runner.protocols import Act, Done, Goal, Hold
@@ -543,8 +544,7 @@ async def test_a_start_says_what_its_model_waits_for_and_how_far_it_is(
     detector, grab = (connect().hello(name) for name in ("detector", "grab"))
 
     async def says(b: Bench, *words: str) -> None:
-        while not all(word in b.skill.phase for word in words):
-            await asyncio.sleep(0.01)
+        await eventually(lambda: all(word in b.skill.phase for word in words))
 
     b.sidecar.consumer, b.sidecar.loads = "grab", asyncio.Event()
     async with AsyncClient("runner", endpoint=arbiter_daemon.endpoint) as client:
