@@ -158,7 +158,6 @@ def test_a_daemon_whose_socket_and_locks_were_deleted_serves_alone(
     try:
         until((first.runtime / "arbiter.sock").exists)
         os.kill(first.pid, signal.SIGCONT)
-        assert first.process is not None
         assert first.process.wait(PATIENCE_S) == 3
         assert first.log.count(f"stopping: an arbiter (pid {other.pid}) already uses") == 1
         with WireClient(first.endpoint) as client:
@@ -184,7 +183,6 @@ def test_the_environment_names_the_endpoint_and_the_flag_wins(make_arbiter: Make
 def test_an_orderly_stop(make_arbiter: Make, number: str) -> None:
     arbiter = make_arbiter().start()
     assert (arbiter.runtime / "arbiter.sock").exists()
-    assert arbiter.process is not None
     arbiter.process.send_signal(getattr(signal, f"SIG{number}"))
     assert arbiter.process.wait(PATIENCE_S) == 0
     assert not (arbiter.runtime / "arbiter.sock").exists()

@@ -18,10 +18,10 @@ client = WireClient(sys.argv[1]).hello("flooder")
 print("up", flush=True)
 while True:
     try:
-        client._socket.send(msgpack.packb({"op": "ping", "id": 9}), zmq.NOBLOCK)
+        client.socket.send(msgpack.packb({"op": "ping", "id": 9}), zmq.NOBLOCK)
     except zmq.Again:
-        while client._socket.poll(1):
-            client._socket.recv()
+        while client.socket.poll(1):
+            client.socket.recv()
 """
 
 
@@ -33,7 +33,6 @@ def flooded(arbiter_daemon: ArbiterProcess) -> Iterator[ArbiterProcess]:
         stdout=subprocess.PIPE,
     )
     try:
-        assert flooder.stdout is not None
         assert flooder.stdout.readline()
         yield arbiter_daemon
     finally:

@@ -50,7 +50,6 @@ def test_a_client_in_a_namespace_below_is_known_by_its_pid_out_here(make_arbiter
             command, env=arbiter.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         try:
-            assert inside.stdout is not None
             assert inside.stdout.readline().strip() == "1", "in there it is the first of all"
             (lease,) = watcher.ask("status")["leases"]
             children = Path(f"/proc/{inside.pid}/task/{inside.pid}/children").read_text().split()

@@ -188,7 +188,6 @@ def test_the_bytes_of_a_cgroup_are_those_of_the_lease_that_names_it(
                 [*python, HOLDER, f"/{cgroup.relative_to(root)}"], env=quick_reader.environ, **pipes
             )
         )
-        assert holder.stdout is not None
         lease_id = holder.stdout.readline().strip()
         gpu = gpu_when(watcher, lambda gpu: not gpu["stowaway_bytes"])
         (process,) = gpu["processes"]

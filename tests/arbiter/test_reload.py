@@ -47,7 +47,6 @@ def reloaded(reloadable: ArbiterProcess, text: str | None) -> None:
         file.unlink()
     else:
         file.write_text(text)
-    assert reloadable.process is not None
     reloadable.process.send_signal(signal.SIGHUP)
     told = reloadable.wait_for("RELOADING=1", 60.0)
     assert int(told.partition("MONOTONIC_USEC=")[2]) > 0

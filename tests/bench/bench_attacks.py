@@ -3,9 +3,10 @@ the most. Limits as shipped."""
 
 import time
 
-from tests.bench.harness import SHIPPED, Peer, Suite, arbiter, elapsed_us, helper, pause
+from tests.bench.harness import SHIPPED, Peer, Suite, arbiter, elapsed_us, pause
 from tests.support.attacks import ATTACKS
 from tests.support.costly import COSTLY
+from tests.support.running import attacked
 from vram_arbiter.arbiter.rpc import codec
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
 
@@ -42,14 +43,13 @@ def requests_under(attack: str, seconds: float) -> list[float]:
     """A ping and an acquire + release in turns, each timed."""
     samples = []
     with arbiter(SHIPPED) as daemon:
-        peer = Peer(daemon.endpoint, "calm").hello()
-        path = daemon.endpoint.removeprefix("ipc://")
-        end_s = time.monotonic() + seconds
-        with helper("attacker.py", attack, path, str(seconds)):
+        peer = Peer(daemon.endpoint, "calm").greeted()
+        with attacked(daemon.endpoint, attack, seconds):
+            end_s = time.monotonic() + seconds
             while time.monotonic() < end_s:
                 pause(CALM_PAUSE_S)
                 samples.append(elapsed_us(lambda: peer.ask("ping")))
                 pause(CALM_PAUSE_S)
-                samples.append(elapsed_us(lambda: peer.release(peer.acquire())))
+                samples.append(elapsed_us(lambda: peer.release(peer.lease())))
         peer.close()
     return samples

@@ -44,11 +44,11 @@ def live_leases(suite: Suite) -> None:
         for count in (1, many):
             daemon = stack.enter_context(arbiter())
             for start in range(0, count, PER_CONNECTION):
-                holder = Peer(daemon.endpoint, f"holder{start}").hello()
+                holder = Peer(daemon.endpoint, f"holder{start}").greeted()
                 stack.callback(holder.close)
                 for _ in range(min(PER_CONNECTION, count - start)):
-                    holder.ready(holder.acquire())
-            peer = Peer(daemon.endpoint, "cycle").hello()
+                    holder.ready(holder.lease())
+            peer = Peer(daemon.endpoint, "cycle").greeted()
             stack.callback(peer.close)
             calls[f"{count}"] = cycle_of(peer)
         found = in_turns(rounds, calls)
@@ -58,17 +58,19 @@ def live_leases(suite: Suite) -> None:
 
 
 def cycle_of(peer: Peer) -> Callable[[], float]:
-    return lambda: elapsed_us(lambda: peer.release(peer.acquire()))
+    return lambda: elapsed_us(lambda: peer.release(peer.lease()))
 
 
 def waiters_memory(suite: Suite) -> None:
     many = suite.size(10_000, 2000)
     with ExitStack() as stack:
         daemon = stack.enter_context(arbiter())
-        first = Peer(daemon.endpoint, "loader").hello()
+        first = Peer(daemon.endpoint, "loader").greeted()
         stack.callback(first.close)
-        first.acquire()  # it loads for ever
-        peers = [Peer(daemon.endpoint, f"w{n}").hello() for n in range(-(-many // PER_CONNECTION))]
+        first.lease()  # it loads for ever
+        peers = [
+            Peer(daemon.endpoint, f"w{n}").greeted() for n in range(-(-many // PER_CONNECTION))
+        ]
         for peer in peers:
             stack.callback(peer.close)
         fill_history(first)
@@ -100,8 +102,8 @@ def disconnects(suite: Suite) -> None:
     most = 10_000 if open_files == resource.RLIM_INFINITY else open_files // 4
     many = min(suite.size(10_000, 1000), most) // CROWD_PROCESSES * CROWD_PROCESSES
     with arbiter() as daemon:
-        witness = Peer(daemon.endpoint, "witness").hello()
-        lease = witness.acquire()
+        witness = Peer(daemon.endpoint, "witness").greeted()
+        lease = witness.lease()
         fill_history(witness)
         before = rss_bytes(daemon.pid)
         crowd = []
@@ -121,7 +123,7 @@ def disconnects(suite: Suite) -> None:
                 end(process)
         witness.ready(lease)
         witness.release(lease)
-        after = [elapsed_us(lambda: witness.release(witness.acquire())) for _ in range(20)]
+        after = [elapsed_us(lambda: witness.release(witness.lease())) for _ in range(20)]
         witness.close()
     survived = f"{many} simultaneous disconnects survived"
     whole = float(waiting == many and forgotten)
@@ -148,7 +150,7 @@ def under_a_flood(suite: Suite) -> None:
     shipped."""
     rounds = suite.size(1500, 150)
     with arbiter(SHIPPED) as daemon:
-        peer = Peer(daemon.endpoint, "calm").hello()
+        peer = Peer(daemon.endpoint, "calm").greeted()
         cycle = cycle_of(peer)
 
         def calm() -> float:

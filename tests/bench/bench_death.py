@@ -13,7 +13,7 @@ from tests.bench.harness import Peer, Suite, arbiter, end, spawn
 
 def run(suite: Suite) -> None:
     with arbiter() as daemon:
-        survivor = Peer(daemon.endpoint, "survivor").hello()
+        survivor = Peer(daemon.endpoint, "survivor").greeted()
         samples = [kill(daemon.endpoint, survivor) for _ in range(suite.size(60, 8))]
         survivor.close()
     over = [granted for granted, _ in samples]

@@ -28,7 +28,7 @@ asked not to, as with `min_residency_s`."""
 def run(suite: Suite) -> None:
     with ExitStack() as stack:
         daemon = stack.enter_context(arbiter(WIDE + NO_HOLD))
-        peers = [Peer(daemon.endpoint, name).hello() for name in ("one", "two")]
+        peers = [Peer(daemon.endpoint, name).greeted() for name in ("one", "two")]
         for peer in peers:
             stack.callback(peer.close)
         at_once = [evict_all(daemon, peers, 0.0) for _ in range(suite.size(200, 20))]
@@ -50,7 +50,7 @@ def evict_all(
     """(acquire → revoke, revoke → release, release or memory back → grant) in microseconds. The
     peers change places."""
     holder, waiter = peers
-    held = holder.acquire(5 * GIB)
+    held = holder.lease(5 * GIB)
     put(daemon.gpu_folder, 5 * GIB)
     holder.ready(held)
     start = time.perf_counter()

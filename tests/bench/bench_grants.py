@@ -16,19 +16,19 @@ def run(suite: Suite) -> None:
     with ExitStack() as stack:
         daemon = stack.enter_context(arbiter())
         bare = stack.enter_context(floor())
-        peer = Peer(daemon.endpoint, "grants").hello()
+        peer = Peer(daemon.endpoint, "grants").greeted()
         stack.callback(peer.close)
 
         def grant() -> float:
             peer.settle()
             lease: list[dict[str, object]] = []
-            took = elapsed_us(lambda: lease.append(peer.acquire()))
+            took = elapsed_us(lambda: lease.append(peer.lease()))
             peer.release(lease[0])
             return took
 
         def cycle() -> float:
             peer.settle()
-            return elapsed_us(lambda: peer.release(peer.acquire()))
+            return elapsed_us(lambda: peer.release(peer.lease()))
 
         calls = {
             FLOOR: bare,

@@ -20,10 +20,10 @@ class Line:
 
     def __init__(self, endpoint: str, clients: int) -> None:
         self.peers = [
-            Peer(endpoint, f"w{index}").hello() for index in range(min(clients, CONNECTIONS_MAX))
+            Peer(endpoint, f"w{index}").greeted() for index in range(min(clients, CONNECTIONS_MAX))
         ]
         self.queue: deque[Peer] = deque()
-        self.holder, self.lease = self.peers[0], self.peers[0].acquire()
+        self.holder, self.lease = self.peers[0], self.peers[0].lease()
         for number in range(1, clients):
             self.join(self.peers[number % len(self.peers)])
 

@@ -59,11 +59,11 @@ def updates(suite: Suite) -> None:
     with ExitStack() as stack:
         daemon = stack.enter_context(arbiter(WIDE))
         for start in range(0, LEASES, PER_CONNECTION):
-            holder = Peer(daemon.endpoint, f"holder{start}").hello()
+            holder = Peer(daemon.endpoint, f"holder{start}").greeted()
             stack.callback(holder.close)
             for _ in range(min(PER_CONNECTION, LEASES - start)):
-                holder.ready(holder.acquire())
-        peer = Peer(daemon.endpoint, "seen").hello()
+                holder.ready(holder.lease())
+        peer = Peer(daemon.endpoint, "seen").greeted()
         stack.callback(peer.close)
         observer = stack.enter_context(ObserverProcess(daemon))
         page = stack.enter_context(open_page(observer.port))
@@ -72,7 +72,7 @@ def updates(suite: Suite) -> None:
         for number in range(suite.size(100, 20)):
             pause(0.13 + 0.017 * (number % 13))  # at every phase of the page's own period
             began = time.perf_counter()
-            lease = peer.acquire()
+            lease = peer.lease()
             page.heard(str(lease["lease_id"]))
             times.append((time.perf_counter() - began) * 1e6)
             peer.release(lease)
@@ -80,7 +80,7 @@ def updates(suite: Suite) -> None:
         suite.limit(name, times, p99_max_us=200_000)
         share = busy_percent(daemon.pid, suite.size(10, 2))
         suite.figure(f"CPU with {LEASES} leases and one page open", share, "% of a core")
-        cycles = {"open": lambda: elapsed_us(lambda: peer.release(peer.acquire()))}
+        cycles = {"open": lambda: elapsed_us(lambda: peer.release(peer.lease()))}
         found = in_turns(suite.size(300, 50), cycles)["open"]
         suite.time("acquire + release meanwhile", found)
 
@@ -95,7 +95,7 @@ def attacks(suite: Suite) -> None:
         "pages of the history": b"GET /history HTTP/1.1\r\nHost: localhost\r\n\r\n" * 20,
     }
     with arbiter(WIDE) as daemon, ObserverProcess(daemon) as observer:
-        port, peer = observer.port, Peer(daemon.endpoint, "calm").hello()
+        port, peer = observer.port, Peer(daemon.endpoint, "calm").greeted()
 
         def ping() -> float:
             return elapsed_us(lambda: peer.ask("ping"))

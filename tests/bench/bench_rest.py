@@ -29,8 +29,8 @@ def run(suite: Suite) -> None:
             "memory of the daemon at rest", rss_bytes(daemon.pid) / 2**20, "MB", at_most=55.0
         )
         suite.figure("CPU of the daemon at rest", share, "% of a core", at_most=0.3)
-        peer = Peer(daemon.endpoint, "resident").hello()
-        peer.ready(peer.acquire())
+        peer = Peer(daemon.endpoint, "resident").greeted()
+        peer.ready(peer.lease())
         share = busy_percent(daemon.pid, suite.size(10, 2))
         suite.figure("CPU with a resident model, read once a second", share, "% of a core")
         environment = environ() | {"VRAM_ARBITER_ENDPOINT": daemon.endpoint}

@@ -22,14 +22,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AsyncExitStack, contextmanager
+from contextlib import AsyncExitStack, ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from tests.bench.harness import SHIPPED, arbiter, p50, p99
+from tests.support.attacks import WITHOUT_A_SESSION
 from tests.support.paths import ROOT
 from tests.support.process import ArbiterProcess
+from tests.support.running import attacked
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
@@ -41,8 +43,6 @@ SKILLS = {"detector": "so101-detector", "grab": "so101-grab"}
 GRAB = "vram-arbiter/so101-grab"
 NAVIGATE = "vram-arbiter/so101-navigate"
 TURN_RAD = 6.0  # some eight seconds of driving
-ATTACKER = ROOT / "tests/support/attacker.py"
-ATTACKS = ("empties", "maps", "more", "connects")
 RATE_HZ = 30.0
 JITTER_MAX_US = 2000.0
 STOP_MAX_US = 10_000.0
@@ -255,7 +255,7 @@ async def _measure(daemon: ArbiterProcess, extent: Extent) -> Measured:
                 await _drive(found, runner, detector, grab, stretch_s)
             found.starting.append(await _start_another(daemon, [process]))
             await _goals(found, runner, detector, grab, 3 * extent.rounds)
-            for attack in ATTACKS:
+            for attack in WITHOUT_A_SESSION:
                 await _attacked(found, runner, attack, stretch_s / 2)
             await _stops(found, runner, extent.stops)
     found.ticks = [json.loads(line) for line in timings.read_text().splitlines()]
@@ -344,7 +344,7 @@ async def _attacked(found: Measured, runner: RunnerClient, attack: str, stretch_
 async def _stops(found: Measured, runner: RunnerClient, count: int) -> None:
     """The last that is measured: the robot stays stopped. First nothing beside, then all attacks at
     once."""
-    for stops_us, attacks in ((found.stops_us, ()), (found.attacked_stops_us, ATTACKS)):
+    for stops_us, attacks in ((found.stops_us, ()), (found.attacked_stops_us, WITHOUT_A_SESSION)):
         with _attackers(runner, attacks):
             for _ in range(count):
                 stops_us.append(await asyncio.to_thread(_stop, path_of(runner.endpoint)))
@@ -366,20 +366,10 @@ def _stop(path: str) -> float:
 
 @contextmanager
 def _attackers(runner: RunnerClient, attacks: Sequence[str]) -> Iterator[None]:
-    path = runner.endpoint.removeprefix("ipc://")
-    started: list[subprocess.Popen[bytes]] = []
-    try:
+    with ExitStack() as stack:
         for attack in attacks:
-            words = [sys.executable, str(ATTACKER), attack, path]
-            started.append(subprocess.Popen(words, stdout=subprocess.PIPE))
-            assert started[-1].stdout is not None
-            if started[-1].stdout.readline() != b"under way\n":
-                raise RuntimeError(f"the attack {attack} did not begin")
+            stack.enter_context(attacked(runner.endpoint, attack, BOOT_S))
         yield
-    finally:
-        for process in started:
-            process.kill()
-            process.communicate()
 
 
 async def _goal(runner: RunnerClient) -> float:

@@ -24,7 +24,7 @@ class Contender:
     """A client of the arbiter."""
 
     def __init__(self, endpoint: str, name: str) -> None:
-        self.peer = Peer(endpoint, name).hello()
+        self.peer = Peer(endpoint, name).greeted()
         self.source: Any = self.peer.socket.fileno()
         self.cycles = 0
 

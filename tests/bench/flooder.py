@@ -13,7 +13,7 @@ BURST = 100
 
 
 def main(endpoint: str) -> None:
-    peer = Peer(endpoint, "flooder").hello()
+    peer = Peer(endpoint, "flooder").greeted()
     ended = threading.Event()
 
     def wait_for_end() -> None:

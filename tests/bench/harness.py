@@ -20,13 +20,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-import msgpack
 import zmq
 
 from tests.support.process import ArbiterProcess
-from vram_arbiter.schemas.defaults import KIB, WIRE_VERSION
+from tests.support.wire import WireClient
+from vram_arbiter.schemas.defaults import KIB
 
 HERE = Path(__file__).parent
 ANSWER_TIMEOUT_S = 30.0
@@ -97,7 +97,6 @@ class Suite:
         at_most: float | None,
         *,
         of: Callable[[Sequence[float]], float] | None = None,
-        note: str | None = None,
     ) -> None:
         """A row that may be so many times its floor: by the median, or by what `of` takes
         of both."""
@@ -114,7 +113,6 @@ class Suite:
             target,
             ok,
             against=against,
-            note=note,
         )
         self.rows.append(row)
 
@@ -240,67 +238,29 @@ def pause(seconds: float) -> None:
 
 
 # -- clients
-class Peer:
+class Peer(WireClient):
     """One connection that speaks the wire by hand. Raises RuntimeError with the daemon's words for
     a refusal."""
 
     def __init__(
-        self,
-        endpoint: str,
-        name: str = "peer",
-        context: "zmq.Context[zmq.Socket[bytes]] | None" = None,
+        self, endpoint: str, name: str = "peer", context: "zmq.Context[Any] | None" = None
     ) -> None:
-        self.socket: zmq.Socket[bytes] = (context or zmq.Context.instance()).socket(zmq.DEALER)
-        self.socket.setsockopt(zmq.LINGER, 0)
-        self.socket.connect(endpoint)
+        super().__init__(endpoint, context=context or zmq.Context.instance())
         self.name = name
-        self._ids = 0
-        self._replies: dict[int, dict[str, Any]] = {}
-        self._pushes: list[dict[str, Any]] = []
 
-    def send(self, op: str, **fields: Any) -> int:
-        self._ids += 1
-        self.socket.send(msgpack.packb({"op": op, "id": self._ids, **fields}))
-        return self._ids
-
-    def reply(self, request: int) -> dict[str, Any]:
-        while request not in self._replies:
-            self._take()
-        reply = self._replies.pop(request)
+    def reply(self, request_id: int | None, timeout_s: float = ANSWER_TIMEOUT_S) -> dict[str, Any]:
+        reply = super().reply(request_id, timeout_s)
         if not reply["ok"]:
             raise RuntimeError(f"{self.name}: {reply['error']['message']}")
         return reply
 
-    def ask(self, op: str, **fields: Any) -> dict[str, Any]:
-        return self.reply(self.send(op, **fields))
-
-    def push(self, kind: str) -> dict[str, Any]:
-        """The next push of a kind, past ones first."""
-        while True:
-            for index, message in enumerate(self._pushes):
-                if message["push"] == kind:
-                    return self._pushes.pop(index)
-            self._take()
-
-    def _take(self) -> None:
-        """One message, whatever it is. Raises TimeoutError."""
-        if not self.socket.poll(int(ANSWER_TIMEOUT_S * 1000)):
-            raise TimeoutError(f"{self.name}: no answer within {ANSWER_TIMEOUT_S:g} s")
-        message: dict[str, Any] = msgpack.unpackb(self.socket.recv())
-        if "push" in message:
-            self._pushes.append(message)
-        else:
-            self._replies[message["re"]] = message
-
     def greet(self) -> int:
-        return self.send(
-            "hello",
-            name=self.name,
-            instance=f"{self.name}-{os.getpid()}-{id(self)}",
-            version=WIRE_VERSION,
-        )
+        """Say hello without waiting for the welcome; the request's id."""
+        instance = f"{self.name}-{os.getpid()}-{id(self)}"
+        return self.send("hello", name=self.name, instance=instance)
 
-    def hello(self) -> "Peer":
+    def greeted(self) -> Self:
+        """Say hello, and wait for the welcome."""
         self.reply(self.greet())
         return self
 
@@ -315,9 +275,9 @@ class Peer:
             "ttl_s": 600.0,
             **spec,
         }
-        return self.send("acquire", nonce=f"{self.name}-{id(self)}-{self._ids}", spec=wanted)
+        return self.send("acquire", nonce=f"{self.name}-{id(self)}-{self._id}", spec=wanted)
 
-    def acquire(self, size: int = SLIVER, **spec: Any) -> dict[str, Any]:
+    def lease(self, size: int = SLIVER, **spec: Any) -> dict[str, Any]:
         """A lease that has been granted."""
         reply = self.reply(self.want(size, **spec))
         lease: dict[str, Any] = (
@@ -339,9 +299,6 @@ class Peer:
         GPU, and cores awake."""
         while self.ask("status")["leases"]:
             pass
-
-    def close(self) -> None:
-        self.socket.close()
 
 
 # -- servers

@@ -5,6 +5,6 @@ import sys
 from tests.bench.harness import Peer
 
 if __name__ == "__main__":
-    Peer(sys.argv[1], "victim").hello().acquire()
+    Peer(sys.argv[1], "victim").greeted().lease()
     print("holds", flush=True)
     sys.stdin.read()

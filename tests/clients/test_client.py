@@ -59,7 +59,7 @@ async def test_acquire_ready_use_release(arbiter_daemon: ArbiterProcess, spec: S
 
 
 async def test_an_evicted_holder_hears_by_whom_and_why(
-    arbiter_daemon: ArbiterProcess, spec: Spec
+    arbiter_daemon: ArbiterProcess, spec: Spec, until: Until
 ) -> None:
     """After an eviction every call on the lease said that it "was released", as if its holder had
     wanted that."""
@@ -76,9 +76,7 @@ async def test_an_evicted_holder_hears_by_whom_and_why(
             await first.ready()
         await second.ready()
         await ops.ask(Evict("lunch", "b"))
-        while second.state != "gone":
-            await anyio.sleep(0.01)
-        assert second.evicted is not None
+        await until(lambda: second.state == "gone")
         assert (second.evicted.cause, second.evicted.by.split()[0]) == ("operator", "ops")
         assert second.evicted.reason.endswith(": lunch")
 
@@ -169,10 +167,7 @@ async def test_leaving_does_not_wait_for_an_arbiter_that_is_away(
     async with within(PATIENCE_S), AsyncClient("t", endpoint=arbiter.endpoint) as client:
         lease = await client.acquire(spec("a", 5, ttl_s=3600), unload=unload)
         await lease.ready()
-        process = arbiter.process
-        assert process is not None
-        process.kill()
-        process.wait()
+        arbiter.kill()
         await until(lambda: not client.connected)
         async with within(REQUEST_TIMEOUT_S / 3):  # for a request it would wait that long
             await lease.give_up()
@@ -180,7 +175,7 @@ async def test_leaving_does_not_wait_for_an_arbiter_that_is_away(
 
 
 async def test_revoked_at_the_safe_point_and_not_before(
-    arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
+    arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start, until: Until
 ) -> None:
     story: list[str] = []
 
@@ -200,8 +195,7 @@ async def test_revoked_at_the_safe_point_and_not_before(
         await lease.ready()
         async with lease.use("first"):
             wanted = beside(waiter.acquire(spec("b", 5)))
-            while not lease.revoking:
-                await anyio.sleep(0.01)
+            await until(lambda: lease.revoking)
             with pytest.raises(LeaseRevoking):
                 async with lease.use("second"):
                     pytest.fail("a use began on a lease that is asked to leave")
@@ -244,7 +238,7 @@ async def test_a_holder_stays_when_nothing_wants_its_room_any_more(
 
 
 async def test_a_use_of_somebody_else_keeps_the_holder_in_place(
-    arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start
+    arbiter_daemon: ArbiterProcess, spec: Spec, beside: Start, until: Until
 ) -> None:
     unloaded = anyio.Event()
 
@@ -259,8 +253,7 @@ async def test_a_use_of_somebody_else_keeps_the_holder_in_place(
         await lease.ready()
         async with runner.use(lease.lease_id, lease.token, "goal"):
             wanted = beside(runner.acquire(spec("b", 5)))
-            while not lease.revoking:
-                await anyio.sleep(0.01)
+            await until(lambda: lease.revoking)
             while (await states(runner))["a"] != "revoking":
                 await anyio.sleep(0.01)
             with anyio.move_on_after(0.6):  # longer than the holder's own retries

@@ -1,7 +1,6 @@
 """The runner's client against a stand-in runner on `clients.net.server`, in the same loop."""
 
 import asyncio
-import contextlib
 import tempfile
 from collections.abc import AsyncIterator
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter
 
+from tests.support.serving import serving
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
@@ -41,15 +41,6 @@ class FakeRunner:
             lambda error: {"ok": False, "error": error.to_wire()},
             message_max_bytes=MESSAGE_MAX_BYTES,
         )
-
-    @contextlib.asynccontextmanager
-    async def serving(self) -> AsyncIterator["FakeRunner"]:
-        async with self.server:
-            task = asyncio.create_task(self.server.serve(self.handle))
-            try:
-                yield self
-            finally:
-                task.cancel()
 
     async def handle(self, peer: Peer, message: dict[str, Any]) -> None:
         TypeAdapter(RunnerRequest).validate_python(message)
@@ -93,7 +84,8 @@ RESULT = {"status": "succeeded", "success": True, "code": "", "message": "", "da
 @pytest.fixture
 async def fake() -> AsyncIterator[FakeRunner]:
     with tempfile.TemporaryDirectory(prefix="rc") as folder:
-        async with FakeRunner(f"ipc://{folder}/r.sock").serving() as runner:
+        runner = FakeRunner(f"ipc://{folder}/r.sock")
+        async with serving(runner.server, runner.handle):
             yield runner
 
 

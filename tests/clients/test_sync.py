@@ -97,7 +97,6 @@ def test_a_use_that_begins_as_the_lease_is_revoked_keeps_it(
         assert unloaded.is_set()
         assert granted.is_set()
         daemon = other.status().daemon
-        assert daemon is not None
         assert not daemon.refusals
 
 

@@ -13,6 +13,7 @@ from tests.sidecars.conftest import MANIFEST
 from tests.support.fakegpu_check import check_log
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import eventually
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.runner import Goal as AcceptedGoal
 from vram_arbiter.clients.runner import RunnerClient
@@ -242,9 +243,7 @@ class Stage:
         return None
 
     async def holding(self) -> None:
-        async with asyncio.timeout(WAIT_S):
-            while not (self.programs.runtime / "policy/holding").exists():
-                await asyncio.sleep(0.01)
+        await eventually((self.programs.runtime / "policy/holding").exists)
 
     async def detector_is_back(
         self, *, after: str = "use_ended", verdicts: tuple[str, ...] = ("verified", "residue")
@@ -264,7 +263,6 @@ class Stage:
         )
         await self.detector.load()  # the arbiter's word is a moment ahead of the sidecar's
         (shown,) = (await self.arbiter.status()).leases
-        assert shown.token is not None
         token = [shown.token.epoch, shown.token.serial]
         assert (await self.detector.ping(timeout_s=WAIT_S))["token"] == token
         assert await self.leases() == {"detector": "held"}

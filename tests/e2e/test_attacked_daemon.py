@@ -6,18 +6,15 @@ and `bare_connects`, and grew without bound under `more_for_ever` and `slow_read
 measures the times exactly.
 """
 
-import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
 import pytest
 
 from tests.support.attacks import ATTACKS
 from tests.support.honest import Honest
-from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
-from tests.support.waiting import PATIENCE_S
+from tests.support.running import attacked
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
@@ -28,19 +25,6 @@ MEMORY_MAX_KIB = 64 * 1024
 """Growth during an attack: at most `Limits.user_in_max_bytes` of half messages, or as much of
 unread answers."""
 OPEN_FILES = 512
-
-
-@contextmanager
-def attack(arbiter: ArbiterProcess, name: str) -> Iterator[Forked]:
-    """An attack under way by another process, ended in order with the block."""
-    said, says = os.pipe()
-    words = [name, arbiter.endpoint.removeprefix("ipc://"), str(ATTACK_S)]
-    attacker = start("attacker", words, arbiter.environ, says)
-    os.close(says)
-    with open(said) as output:
-        assert output.readline() == "attacking\n"
-    yield attacker
-    assert attacker.wait(PATIENCE_S) == 0
 
 
 @pytest.fixture(scope="module")
@@ -58,15 +42,16 @@ def honest() -> Iterator[Honest]:
 def test_an_attack_costs_others_little_and_leaves_nothing(honest: Honest, name: str) -> None:
     """Regression: libzmq's ROUTER asserts on forged identities and counts messages, not bytes."""
     client, before_kib = honest.client, honest.memory_kib_now()
-    with attack(honest.arbiter, name) as attacker:
+    with attacked(honest.arbiter.endpoint, name, ATTACK_S) as attacker:
         took_s, grown_kib = [], 0
-        while attacker.poll() is None:
+        while attacker.process.poll() is None:
             began = time.monotonic()
             assert client.ask("ping")["ok"]
             took_s.append(time.monotonic() - began)
             grown_kib = max(grown_kib, honest.memory_kib_now() - before_kib)
             with WireClient(honest.arbiter.endpoint) as late:  # of the same user: it finds room too
                 assert late.hello("late", instance="late").ask("bye")["ok"]
+        assert attacker.ended() == 0
     assert sorted(took_s)[int(0.99 * len(took_s))] <= P99_MAX_S
     assert grown_kib <= MEMORY_MAX_KIB
     honest.is_alone()
@@ -86,11 +71,12 @@ def test_a_slow_reader_of_a_long_history_holds_little_memory(
             assert writer.ask("release", lease_id=lease["lease_id"], token=lease["token"])["ok"]
         assert writer.ask("bye")["ok"]
         before_kib = honest.memory_kib_now()
-        with attack(arbiter, "slow_reader") as attacker:
+        with attacked(arbiter.endpoint, "slow_reader", ATTACK_S) as attacker:
             grown_kib = 0
-            while attacker.poll() is None:
+            while attacker.process.poll() is None:
                 assert client.ask("ping")["ok"]
                 client.receive(0.002)  # within its own rate
                 grown_kib = max(grown_kib, honest.memory_kib_now() - before_kib)
+            assert attacker.ended() == 0
         assert grown_kib <= MEMORY_MAX_KIB
         honest.is_alone()

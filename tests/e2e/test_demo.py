@@ -20,11 +20,10 @@ import pytest
 
 from tests.support.prepared import warm
 from tests.support.waiting import until
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.runtime.ports import free_port
 
 pytestmark = [pytest.mark.e2e, pytest.mark.heavy, pytest.mark.timeout(720)]
-
-GIB = 1 << 30
 
 
 def run_demo(

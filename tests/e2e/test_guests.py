@@ -22,7 +22,7 @@ import pytest
 
 from tests.support.guests import USER, Server, sshd_server
 from tests.support.process import Make
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 from tests.support.wire import WireClient
 from vram_arbiter.clients.sync import Client, Lease
 from vram_arbiter.schemas.errors import RemoteMayNotHold
@@ -35,7 +35,6 @@ pytestmark = [
 KILLED_S = 1.0
 """0.1 s on a free machine."""
 SILENT_S = 5.0
-PATIENCE_S = 60.0
 Ends = Callable[["subprocess.Popen[str]", Server], object]
 KILLED: dict[str, Ends] = {
     "ssh is killed": lambda ssh, _: ssh.kill(),

@@ -17,11 +17,11 @@ import pytest
 from tests.support.honest import Honest
 from tests.support.hostile import BOMBS, Forger
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 GIB, MIB = 1 << 30, 1 << 20
-PATIENCE_S = 60.0
 LARGE_BYTES = 8192
 ATTACKER = """
 import json, msgpack, os, sys, zmq
@@ -72,7 +72,6 @@ while True:
         pass
 """,
     )
-    assert flood.stdout is not None
     assert flood.stdout.readline(), "it floods"
     for _ in range(20):
         honest.is_served()
@@ -88,7 +87,7 @@ def test_one_that_never_reads_loses_its_answers_and_costs_nobody_else(
         honest.arbiter,
         """
 client = WireClient(endpoint).hello("deaf")
-client._socket.setsockopt(zmq.SNDTIMEO, 200)
+client.socket.setsockopt(zmq.SNDTIMEO, 200)
 assert client.ask("subscribe")["ok"]
 frame = msgpack.packb({"op": "status", "id": 1})
 sent = 0
@@ -101,7 +100,6 @@ done(sent=sent)
 sys.stdin.readline()
 """,
     )
-    assert deaf.stdout is not None
     assert deaf.stdout.readline(), "it has sent all that it could"
     for _ in range(10):
         honest.is_served()
@@ -145,11 +143,9 @@ def test_bombs_and_giants_are_answered_or_cut_off(honest: Honest, connect: Conne
             bomber.hello("bomber")
     bomber.send_frames([b"a", b"b", b"c"])
     answer = bomber.receive()
-    assert answer is not None
     assert answer["error"]["code"] == "bad_frame"
     bomber.send_raw(b"\xc6" + (3 * MIB).to_bytes(4, "big") + bytes(3 * MIB))
     answer = bomber.receive()
-    assert answer is not None
     assert answer["error"]["code"] == "message_too_large"
     for _ in range(4):
         giant = connect().hello("giant")

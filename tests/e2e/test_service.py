@@ -21,15 +21,15 @@ from typing import Any
 import pytest
 
 from tests.support.children import spawn
+from tests.support.paths import ROOT
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from tests.support.wire import WireClient
+from vram_arbiter.schemas.defaults import GIB
 
 pytestmark = pytest.mark.e2e
-PATIENCE_S = 60
-GIB = 1 << 30
 NOBODYS_GID = 1  # `daemon` or `bin`, which no user is in
-TREE = Path(__file__).parents[2]
-UNIT = TREE / "configs" / "systemd" / "system" / "vram-arbiter.service"
+UNIT = ROOT / "configs" / "systemd" / "system" / "vram-arbiter.service"
 
 
 class Service(ArbiterProcess):
@@ -133,7 +133,6 @@ def test_a_holder_outlives_the_service_with_its_lease(
     holder.until("ready")
     holder.tell("use")
     holder.until("in_use")
-    assert service.process is not None
     service.process.send_signal(number)
     service.process.wait(PATIENCE_S)
     assert holder.alive
@@ -210,7 +209,6 @@ def test_without_any_capability_it_serves_and_watches_other_users() -> None:
                 [sys.executable, "-c", textwrap.dedent(STRANGER), service.endpoint],
                 env=service.environ, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
             )  # fmt: skip
-            assert stranger.stdout is not None
             lease_id = stranger.stdout.readline().strip()
             (lease,) = watcher.ask("status")["leases"]
             assert (lease["lease_id"], lease["pid"]) == (lease_id, stranger.pid)

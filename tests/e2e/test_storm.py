@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.paths import ROOT
+
 pytestmark = pytest.mark.e2e
-ROOT = Path(__file__).parents[2]
 
 
 def test_a_short_storm_leaves_every_promise_kept(tmp_path: Path) -> None:

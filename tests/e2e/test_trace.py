@@ -18,6 +18,8 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.support.paths import ROOT
+
 pytest.importorskip("prometheus_client", reason="the extra `telemetry`")
 
 from tests.sidecars.conftest import MANIFEST
@@ -36,7 +38,6 @@ from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(280)]
 
-ROOT = Path(__file__).parents[2]
 GRAB = ROOT / "configs/rskills/so101-grab"
 START_S, MOVES_S = 90.0, 120.0
 ARBITER, RUNNER, REASONER = "vram-arbiter", "vram-runner", "vram-reasoner"

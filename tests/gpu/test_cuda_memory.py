@@ -8,11 +8,10 @@ import pytest
 
 from tests.gpu.conftest import without_cuda
 from vram_arbiter.clients.calibration.gpu import open_gpu
+from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.errors import OutOfMemory
 
 pytestmark = [pytest.mark.gpu, pytest.mark.heavy]
-
-MIB = 2**20
 
 
 @pytest.fixture(autouse=True)

@@ -59,7 +59,6 @@ def load(machine: str) -> type[RuleBasedStateMachine]:
     """A machine from its test file."""
     path, name = MACHINES[machine]
     spec = importlib.util.spec_from_file_location(f"nightly_{machine}", ROOT / path)
-    assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module

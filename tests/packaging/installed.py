@@ -10,7 +10,8 @@ import sys
 import tomllib
 from pathlib import Path
 
-TREE = Path(__file__).parents[2]
+from tests.support.paths import ROOT
+
 # without the environment
 PYTHON = Path(sys._base_executable).resolve()  # type: ignore[attr-defined]
 DEPENDENCIES = Path(site.getsitepackages()[0])
@@ -27,13 +28,13 @@ def install_into(
 
     `seen_at`, `python` and `dependencies` are the paths as the programs see them.
     """
-    project = tomllib.loads((TREE / "pyproject.toml").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
     packages = prefix / "lib" / version / "site-packages"
     packages.mkdir(parents=True)
     wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
     for name in wheel["packages"]:  # its links are followed, as by the wheel's builder
-        shutil.copytree(TREE / name, packages / Path(name).name)
+        shutil.copytree(ROOT / name, packages / Path(name).name)
     (packages / "dependencies.pth").write_text(f"{dependencies}\n")
 
     (prefix / "pyvenv.cfg").write_text(

@@ -19,7 +19,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from tests.packaging.installed import DEPENDENCIES, PYTHON, TREE, install_into
+from tests.packaging.installed import DEPENDENCIES, PYTHON, install_into
+from tests.support.paths import ROOT
 
 SYSTEMD = Path("/lib/systemd/systemd")
 TOOLS = ("unshare", "nsenter", "setpriv", "pivot_root", "systemctl", "ldconfig")
@@ -103,7 +104,7 @@ class Machine:
             boot = [
                 "unshare", "--fork", "--kill-child", "--pid", "--mount", "--uts", "--ipc", "--net",
                 "--cgroup",
-                str(Path(__file__).with_name("boot_machine.sh")), str(self._scratch), str(TREE),
+                str(Path(__file__).with_name("boot_machine.sh")), str(self._scratch), str(ROOT),
                 str(self.prefix), sys.base_prefix, str(DEPENDENCIES),
             ]  # fmt: skip
             into_cgroup = (
@@ -161,7 +162,6 @@ class Machine:
                 self.inside("/opt/vram-arbiter/bin/python", "-c", code),
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
             )  # fmt: skip
-        assert self._answering.stdin is not None
         assert self._answering.stdout is not None
         self._answering.stdin.write(f"{line}\n")
         return json.loads(self._answering.stdout.readline())

@@ -22,13 +22,14 @@ from typing import Any, cast
 import pytest
 import yaml
 
-from tests.packaging.installed import DEPENDENCIES, PYTHON, TREE, install_into
+from tests.packaging.installed import DEPENDENCIES, PYTHON, install_into
 from tests.packaging.machine import TOOLS, obstacle
+from tests.support.paths import ROOT
 from tests.support.waiting import PATIENCE_S, until
 from vram_arbiter.clients.cli.doctor.health import UNIT_SCORE
 from vram_arbiter.schemas.runtime.trust import SERVICE_USERS
 
-FOLDER = TREE / "configs" / "containers"
+FOLDER = ROOT / "configs" / "containers"
 IMAGES = {"arbiter": "Containerfile", "reward": "Containerfile.sidecar"}
 OBSTACLE = obstacle()
 
@@ -83,7 +84,6 @@ def test_the_compose_file_follows_its_specification() -> None:
     """The schema of compose-spec, as check-jsonschema brings it."""
     jsonschema = pytest.importorskip("jsonschema", reason="the dependency group `dev`")
     found = find_spec("check_jsonschema")  # not imported: that takes seconds
-    assert found is not None
     assert found.origin is not None
     vendored = Path(found.origin).parent / "builtin_schemas/vendor/compose-spec.json"
     schema = json.loads(vendored.read_text(encoding="utf-8"))
@@ -97,8 +97,8 @@ def test_the_compose_file_follows_its_specification() -> None:
 @pytest.mark.parametrize("service", IMAGES)
 def test_a_service_is_restricted_and_reaches_gpu_and_socket(service: str) -> None:
     found, image = compose()["services"][service], text_of(IMAGES[service])
-    assert (TREE / found["build"]["dockerfile"]).samefile(FOLDER / IMAGES[service])
-    assert (FOLDER / found["build"]["context"]).samefile(TREE)
+    assert (ROOT / found["build"]["dockerfile"]).samefile(FOLDER / IMAGES[service])
+    assert (FOLDER / found["build"]["context"]).samefile(ROOT)
     assert found["read_only"] is True
     assert found["cap_drop"] == ["ALL"]
     assert found["restart"] == "unless-stopped"
@@ -107,7 +107,7 @@ def test_a_service_is_restricted_and_reaches_gpu_and_socket(service: str) -> Non
     assert devices["driver"] == "nvidia"
     wanted = set(image.environ["NVIDIA_DRIVER_CAPABILITIES"].split(","))
     assert set(devices["capabilities"]) == {"gpu", *wanted}
-    scripts = tomllib.loads((TREE / "pyproject.toml").read_text())["project"]["scripts"]
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     program = Path(image.entrypoint[0])
     assert program.parent == Path("/opt/vram-arbiter/bin")
     assert program.name in scripts

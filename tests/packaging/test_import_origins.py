@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-TREE = Path(__file__).parents[2]
+from tests.support.paths import ROOT
+
 PACKAGES = ("arbiter", "clients", "sidecars", "runner", "reasoner", "schemas", "testing")
 HEAVY = (
     "torch",
@@ -31,9 +32,9 @@ HEAVY = (
 )
 
 BASE_MODULES = [
-    ".".join(("vram_arbiter", *path.relative_to(TREE).with_suffix("").parts))
+    ".".join(("vram_arbiter", *path.relative_to(ROOT).with_suffix("").parts))
     for package in ("arbiter", "clients", "schemas", "testing")
-    for path in sorted((TREE / package).rglob("*.py"))
+    for path in sorted((ROOT / package).rglob("*.py"))
     if path.name not in ("__init__.py", "__main__.py")
     if {"observer", "top"}.isdisjoint(path.parts)  # these need an extra
 ]
@@ -61,7 +62,7 @@ bare = [name for name, spec in specs.items() if spec is not None]
 print(json.dumps([list(vram_arbiter.__path__), bare]))
 """
     assert json.loads(in_a_fresh_interpreter(code, tmp_path)) == [
-        [str(TREE / "src/vram_arbiter")],
+        [str(ROOT / "src/vram_arbiter")],
         [],
     ]
 
@@ -70,7 +71,7 @@ def test_no_code_imports_the_bare_names() -> None:
     """A project with its own `schemas/` or `clients/` would hide ours."""
     found = subprocess.run(
         ["git", "grep", "-nE", rf"^ *(from|import) ({'|'.join(PACKAGES)})(\\.| )", "--", "*.py"],
-        cwd=TREE, capture_output=True, text=True, timeout=60,
+        cwd=ROOT, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     assert (found.returncode, found.stdout) == (1, ""), found.stdout + found.stderr
 
@@ -92,13 +93,13 @@ def test_a_project_with_its_own_schemas_and_clients_can_use_ours(tmp_path: Path)
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_packages_are_reached_through_links(package: str) -> None:
-    link = TREE / "src/vram_arbiter" / package
+    link = ROOT / "src/vram_arbiter" / package
     assert link.is_symlink()
-    assert link.resolve() == TREE / package
+    assert link.resolve() == ROOT / package
 
 
 def test_the_package_is_typed() -> None:
-    assert (TREE / "src/vram_arbiter/py.typed").is_file()
+    assert (ROOT / "src/vram_arbiter/py.typed").is_file()
 
 
 def test_base_packages_and_programs_import_nothing_heavy(tmp_path: Path) -> None:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-TREE = Path(__file__).parents[2]
-SCRIPT = TREE / ".ci/jetson"
+from tests.support.paths import ROOT
+
+SCRIPT = ROOT / ".ci/jetson"
 SHELLCHECK = Path(sys.executable).with_name("shellcheck")
 JETPACK_7 = "# R38 (release), REVISION: 2.0, GCID: 41844464, BOARD: generic, EABI: aarch64\n"
 TOOLS = ("apt-get", "apt-cache", "dpkg", "git", "cmake", "uv", "gst-inspect-1.0", "id")
@@ -129,7 +130,7 @@ def test_packages_that_no_source_has_are_named(board: Board) -> None:
 
 
 def test_the_shell_scripts_are_clean() -> None:
-    scripts = [*TREE.glob(".ci/*"), *TREE.glob("configs/**/*.sh"), *TREE.glob("tests/**/*.sh")]
+    scripts = [*ROOT.glob(".ci/*"), *ROOT.glob("configs/**/*.sh"), *ROOT.glob("tests/**/*.sh")]
     assert SCRIPT in scripts
     found = subprocess.run([SHELLCHECK, *scripts], capture_output=True, text=True)
     assert found.returncode == 0, found.stdout

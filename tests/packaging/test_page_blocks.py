@@ -23,8 +23,9 @@ import pytest
 import yaml
 
 from docs.hooks.programs import parsers, subcommands
-from tests.packaging.test_pages import PAGES, TREE
+from tests.packaging.test_pages import PAGES
 from tests.support.deployment import load_robot
+from tests.support.paths import ROOT
 from vram_arbiter.schemas.config.arbiter import load_config
 from vram_arbiter.schemas.config.gateway import load_gateway, load_keys
 from vram_arbiter.schemas.config.observer import load_observer
@@ -48,7 +49,7 @@ class Block(NamedTuple):
     text: str
 
     def __str__(self) -> str:
-        return f"{self.page.relative_to(TREE)}: {self.text.splitlines()[0]}"
+        return f"{self.page.relative_to(ROOT)}: {self.text.splitlines()[0]}"
 
 
 def blocks() -> Iterator[Block]:
@@ -61,7 +62,7 @@ def blocks() -> Iterator[Block]:
 BLOCKS = list(blocks())
 programs = functools.cache(parsers)
 EXTRA = re.compile(r"(?:vram-arbiter|'\.)\[([\w,-]+)\]")
-TARGETS = set(re.findall(r"^([a-z-]+):", (TREE / "Makefile").read_text(), re.MULTILINE))
+TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 
 
 def of(language: str) -> list[Block]:
@@ -152,7 +153,7 @@ def test_commands_are_what_the_programs_take() -> None:
         program, arguments = call
         seen.append(program)
         if problem := unknown_flags(program, arguments) or refused_block(program, arguments):
-            wrong.append(f"{block.page.relative_to(TREE)}: {' '.join(words)}: {problem}")
+            wrong.append(f"{block.page.relative_to(ROOT)}: {' '.join(words)}: {problem}")
     assert wrong == []
     assert set(seen) == set(programs())
     assert len(seen) > 100
@@ -167,7 +168,7 @@ def test_commands_within_sentences_have_known_flags() -> None:
         for span in INLINE.findall(text):
             for words in commands(span):
                 if (call := called(words)) and (unknown := unknown_flags(*call)):
-                    wrong.append(f"{page.relative_to(TREE)}: {span}: {unknown}")
+                    wrong.append(f"{page.relative_to(ROOT)}: {span}: {unknown}")
     assert wrong == []
 
 
@@ -178,12 +179,12 @@ def test_targets_and_files_of_commands_exist() -> None:
         targets = words[1:2] if words[:1] == ["make"] else []
         missing += [f"{block}: {name}" for name in targets if name not in TARGETS]
         files = [word for word in words if re.match(r"(examples|configs|tests)/", word)]
-        missing += [f"{block}: {name}" for name in files if not (TREE / name).exists()]
+        missing += [f"{block}: {name}" for name in files if not (ROOT / name).exists()]
     assert missing == []
 
 
 def test_named_extras_exist() -> None:
-    project = tomllib.loads((TREE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     named = {
         extra
         for page in PAGES
@@ -220,7 +221,7 @@ def robot_of_block(**parts: object) -> None:
 
 
 def skill_of_block(**parts: object) -> None:
-    shipped = (TREE / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
+    shipped = (ROOT / "configs/rskills/so101-grab/rskill.yaml").read_text(encoding="utf-8")
     parse_manifest(yaml.safe_dump({**yaml.safe_load(shipped), **parts}))
 
 
@@ -267,7 +268,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
-        cwd=TREE, capture_output=True, text=True, timeout=SITE_LIMIT_S, check=False,
+        cwd=ROOT, capture_output=True, text=True, timeout=SITE_LIMIT_S, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return folder
@@ -322,7 +323,7 @@ def luminance(color: str) -> float:
 @pytest.mark.parametrize("scheme", TEXTS)
 def test_texts_of_the_site_have_the_contrast_of_wcag_aa(scheme: str) -> None:
     """White on the theme's teal had 3.8:1, the tabs 2.6:1."""
-    style = (TREE / "docs/site.css").read_text(encoding="utf-8")
+    style = (ROOT / "docs/site.css").read_text(encoding="utf-8")
     colors: dict[str, str] = {}
     for selector, body in re.findall(r"^(\[.*?) \{(.*?)\}", style, re.MULTILINE | re.DOTALL):
         if "scheme" not in selector or scheme in selector:
@@ -345,7 +346,7 @@ def test_the_reference_has_every_command_key_and_error(site: Path) -> None:
             ]
             assert missing == [], name
     configuration = (site / "reference/configuration.html").read_text(encoding="utf-8")
-    shipped = yaml.safe_load((TREE / "configs/arbiter.yaml").read_text(encoding="utf-8"))
+    shipped = yaml.safe_load((ROOT / "configs/arbiter.yaml").read_text(encoding="utf-8"))
     keys = [key for section in shipped.values() for key in section]
     assert [key for key in keys if f"<code>{key}</code>" not in configuration] == []
     api = (site / "reference/api.html").read_text(encoding="utf-8")

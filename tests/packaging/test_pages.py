@@ -4,7 +4,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-TREE = Path(__file__).parents[2]
+from tests.support.paths import ROOT
+
 FOLDERS = (
     "arbiter|clients|schemas|sidecars|runner|reasoner|testing|configs|examples|docs|"
     "tests|training|src"
@@ -14,7 +15,7 @@ LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)(?:#([\w-]+))?\)")
 PLACES = ("docs", "training", "configs/models")
 CODE = {".conf", ".example", ".py", ".service", ".sh", ".toml", ".yaml", ".yml"}
 PAGES = sorted(
-    [*TREE.glob("*.md"), *(page for top in PLACES for page in (TREE / top).rglob("*.md"))]
+    [*ROOT.glob("*.md"), *(page for top in PLACES for page in (ROOT / top).rglob("*.md"))]
 )
 
 
@@ -41,7 +42,7 @@ def test_named_paths_exist() -> None:
     """The changelog speaks of the past and may name what is gone."""
     missing = []
     for page, name, function in named(PATH):
-        found = [root / name for root in (TREE, TREE / "tests") if (root / name).exists()]
+        found = [root / name for root in (ROOT, ROOT / "tests") if (root / name).exists()]
         if not found or (function and not defines(found[0], function)):
             missing.append(f"{page}: {name}::{function}")
     assert [line for line in missing if "CHANGELOG.md: " not in line] == []
@@ -60,21 +61,21 @@ def test_pages_that_code_names_exist() -> None:
     """Error texts, comments and configuration files name pages, which move."""
     missing = []
     for folder in FOLDERS.split("|"):
-        for path in (TREE / folder).rglob("*"):
+        for path in (ROOT / folder).rglob("*"):
             if path.suffix in CODE and path.is_file() and not path.is_symlink():
                 named = re.findall(r"(?<![\w/])docs/[\w/-]+\.md", path.read_text(encoding="utf-8"))
-                missing += [f"{path}: {name}" for name in named if not (TREE / name).exists()]
+                missing += [f"{path}: {name}" for name in named if not (ROOT / name).exists()]
     assert missing == []
 
 
 def test_the_map_is_short() -> None:
-    assert len((TREE / "ARCHITECTURE.md").read_text(encoding="utf-8").splitlines()) <= 200
+    assert len((ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").splitlines()) <= 200
 
 
 def test_decisions_are_titled_by_their_numbers() -> None:
     """Their list is made of the titles."""
     wrong = []
-    for path in (TREE / "docs/explanation/adr").glob("0*.md"):
+    for path in (ROOT / "docs/explanation/adr").glob("0*.md"):
         title = path.read_text(encoding="utf-8").partition("\n")[0]
         if not re.fullmatch(rf"# {int(path.name[:3])}\. .+", title):
             wrong.append(path.name)
@@ -83,7 +84,7 @@ def test_decisions_are_titled_by_their_numbers() -> None:
 
 def test_every_sentence_of_the_design_records_has_one_place() -> None:
     """Code and its test, which `test_named_paths_exist` finds; a decision where it is missing."""
-    text = (TREE / "docs/explanation/records.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/explanation/records.md").read_text(encoding="utf-8")
     rows = re.findall(r"^- \*\*([EVRC][\w–, -]+)\*\* (.+(?:\n  .+)*)$", text, re.MULTILINE)
     found: list[str] = []
     for sentences, place in rows:
@@ -98,12 +99,12 @@ def test_every_sentence_of_the_design_records_has_one_place() -> None:
 def test_every_page_is_on_the_site() -> None:
     """A page that mkdocs.yml does not name fails `make docs`; decisions are listed by their own
     page."""
-    nav = (TREE / "mkdocs.yml").read_text(encoding="utf-8").split("\nnav:\n")[1]
+    nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("\nnav:\n")[1]
     named = set(re.findall(r"[\w/.-]+\.md", nav))
     pages = {
-        page.relative_to(TREE / "docs").as_posix()
+        page.relative_to(ROOT / "docs").as_posix()
         for page in PAGES
-        if page.is_relative_to(TREE / "docs")
+        if page.is_relative_to(ROOT / "docs")
     }
     decisions = {page for page in pages if re.search(r"adr/\d", page)}
     assert pages - decisions - named == set()

@@ -17,14 +17,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.packaging.installed import TREE, install_into
+from tests.packaging.installed import install_into
+from tests.support.paths import ROOT
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.configs import configs_folder, shipped
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.manifest import load_manifest
 
 pytestmark = pytest.mark.e2e
-PAGE = (TREE / "README.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "README.md").read_text(encoding="utf-8")
 LIMIT_S = 240.0
 INSTALLS = "^(make|pip) "
 OTHER_SIDECARS = "^vram-sidecar --name (detector|scene-vlm) "
@@ -40,16 +41,16 @@ class Reader:
             (folder / name).mkdir(mode=0o700)
         install_into(folder / "prefix")
         self._folder = folder
-        git = ["git", "-C", str(TREE)]
+        git = ["git", "-C", str(ROOT)]
         listed = subprocess.run(
             [*git, "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
             capture_output=True, text=True, check=True, timeout=60,
         )  # fmt: skip
         for name in filter(None, listed.stdout.split("\0")):
-            if (TREE / name).exists():  # else it is about to be removed
+            if (ROOT / name).exists():  # else it is about to be removed
                 place = folder / "clone" / name
                 place.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy2(TREE / name, place, follow_symlinks=False)
+                shutil.copy2(ROOT / name, place, follow_symlinks=False)
 
     def types(self, *sections: str, skip: str, page: str = "README.md") -> str:
         """Everything that is printed. Fails the test at the first command that fails."""
@@ -70,7 +71,7 @@ class Reader:
 
 @pytest.fixture(scope="module")
 def reader() -> Iterator[Reader]:
-    if shutil.which("git") is None or not (TREE / ".git").exists():
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("needs git and a checkout")
     folder = Path(tempfile.mkdtemp(prefix="vr"))  # short: sockets lie below it
     try:
@@ -121,7 +122,7 @@ def test_a_command_that_fails_fails_the_script(reader: Reader, tmp_path: Path) -
     """The check can fail."""
     (tmp_path / "README.md").write_text("## A\n```sh\ntrue  # fine\nfalse\n```\n")
     done = subprocess.run(
-        [str(TREE / "tests/packaging/readme.sh")],
+        [str(ROOT / "tests/packaging/readme.sh")],
         cwd=tmp_path, env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}, capture_output=True,
         text=True, timeout=60,
     )  # fmt: skip
@@ -144,7 +145,7 @@ def test_the_example_runs_as_printed(
 ) -> None:
     """It ended in a traceback: its `unload` is a plain function, and only coroutine functions were
     taken."""
-    text = (TREE / page).read_text(encoding="utf-8")
+    text = (ROOT / page).read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     path = tmp_path / "example.py"
     path.write_text(example)

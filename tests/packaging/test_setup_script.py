@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-TREE = Path(__file__).parents[2]
+from tests.support.paths import ROOT
+
 TOOLS = ("bash", "cat", "cksum", "dirname", "env", "grep", "rm", "uname")
 
 
@@ -23,7 +24,7 @@ def project(tmp_path: Path) -> Path:
     folder = tmp_path / "project"
     (folder / ".ci").mkdir(parents=True)
     for name in (".ci/setup", "pyproject.toml", HASHED):
-        shutil.copy(TREE / name, folder / name)
+        shutil.copy(ROOT / name, folder / name)
     (folder / "bin").mkdir()
     for tool in TOOLS:
         found = shutil.which(tool)

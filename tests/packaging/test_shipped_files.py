@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.paths import ROOT
 from vram_arbiter.schemas.manifest import load_manifest
 
-TREE = Path(__file__).parents[2]
-MANIFESTS = sorted((TREE / "configs").rglob("rskill.yaml"))
+MANIFESTS = sorted((ROOT / "configs").rglob("rskill.yaml"))
 CONSTRAINTS = [
     line
-    for line in (TREE / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     if not line.startswith("#")
 ]
 
@@ -35,7 +35,7 @@ def test_constraints_are_plain_versions() -> None:
 
 
 def test_every_version_has_hashes() -> None:
-    lines = (TREE / "constraints-hashed.txt").read_text(encoding="utf-8").splitlines()
+    lines = (ROOT / "constraints-hashed.txt").read_text(encoding="utf-8").splitlines()
     form = r"([\w.-]+==[\w.]+)(?: ; [^#]+?)?(?: --hash=sha256:[0-9a-f]{64})+"
     matches = {line[:80]: re.fullmatch(form, line) for line in lines}
     assert [line for line, match in matches.items() if match is None] == []
@@ -43,7 +43,7 @@ def test_every_version_has_hashes() -> None:
 
 
 def test_every_dependency_is_constrained() -> None:
-    page = tomllib.loads((TREE / "pyproject.toml").read_text(encoding="utf-8"))
+    page = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     sets = [
         page["project"]["dependencies"],
         *page["project"]["optional-dependencies"].values(),
@@ -64,7 +64,7 @@ def test_the_list_of_packages_has_them_all_with_their_hashes(tmp_path: Path) -> 
     made = tmp_path / "sbom.json"
     options = ["--pyproject", "pyproject.toml", "--output-file", str(made)]
     command = [f"{Path(sys.executable).parent}/cyclonedx-py", "requirements", *options]
-    subprocess.run([*command, "constraints-hashed.txt"], cwd=TREE, check=True, capture_output=True)
+    subprocess.run([*command, "constraints-hashed.txt"], cwd=ROOT, check=True, capture_output=True)
     listed = json.loads(made.read_text(encoding="utf-8"))["components"]
     assert sorted(f"{one['name']}=={one['version']}" for one in listed) == sorted(CONSTRAINTS)
     assert [one["name"] for one in listed if "SHA-256" not in json.dumps(one)] == []
@@ -72,6 +72,6 @@ def test_the_list_of_packages_has_them_all_with_their_hashes(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("script", [".ci/setup", ".ci/run", ".ci/lock"])
 def test_scripts_can_be_run(script: str) -> None:
-    path = TREE / script
+    path = ROOT / script
     assert path.stat().st_mode & 0o111
     assert path.read_text(encoding="utf-8").startswith("#!/usr/bin/env bash\n")

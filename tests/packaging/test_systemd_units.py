@@ -16,11 +16,11 @@ from pathlib import Path
 import pytest
 
 from tests.packaging.test_page_blocks import unknown_flags
+from tests.support.paths import ROOT
 from vram_arbiter.clients.cli.installation.site import PROGRAMS, SYSTEM
 from vram_arbiter.clients.cli.main import run_main
 
-TREE = Path(__file__).parents[2]
-SOURCES = TREE / "configs" / "systemd"
+SOURCES = ROOT / "configs" / "systemd"
 UNITS = (
     "vram-arbiter.service",
     "vram-sidecar@.service",
@@ -311,6 +311,6 @@ def test_users_and_folders_are_made_below_a_root_of_their_own(installed: Path) -
 
 
 def test_the_page_names_every_unit() -> None:
-    page = (TREE / "docs/how-to/systemd.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/how-to/systemd.md").read_text(encoding="utf-8")
     for name in (*UNITS, "usermod", "journalctl", "vramctl install", "--user-units"):
         assert name.removesuffix(".service").removesuffix("@") in page

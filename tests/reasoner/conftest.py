@@ -12,6 +12,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from tests.support.field_server import PNG
+from tests.support.serving import serving
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.errors import BadRequest, FrameStale, GoalRejected, VramError
@@ -52,13 +53,9 @@ class Runner:
         self.result_error: VramError | None = None
         self.heard = asyncio.Event()
         """An op that is not answered has come."""
-        self._server = RouterServer(
+        self.server = RouterServer(
             endpoint, lambda error: {"re": None, "ok": False, "error": error.to_wire()}
         )
-
-    async def serve(self) -> None:
-        async with self._server:
-            await self._server.serve(self._handle)
 
     async def end(self, status: str = "succeeded", *, code: str = "", message: str = "") -> None:
         assert self.goal is not None, "no goal runs"
@@ -73,7 +70,7 @@ class Runner:
             "message": message,
             "data": {},
         }
-        await self._server.send(self.peer, push)
+        await self.server.send(self.peer, push)
 
     async def feed(self, progress: float, state: str = "running") -> None:
         assert self.goal is not None, "no goal runs"
@@ -86,20 +83,20 @@ class Runner:
             "tick_idx": 0,
             "detail": "",
         }
-        await self._server.send(self.peer, push)
+        await self.server.send(self.peer, push)
 
-    async def _handle(self, peer: Peer, message: Message) -> None:
+    async def handle(self, peer: Peer, message: Message) -> None:
         request = TypeAdapter[Any](RunnerRequest).validate_python(message)
         number = {"re": request.id}
         try:
             reply = await self._answer(peer, request)
         except VramError as error:
-            await self._server.send(peer, {**number, "ok": False, "error": error.to_wire()})
+            await self.server.send(peer, {**number, "ok": False, "error": error.to_wire()})
             return
         if request.op in self.deaf:
             self.heard.set()
         else:
-            await self._server.send(peer, {**number, "ok": True, **reply})
+            await self.server.send(peer, {**number, "ok": True, **reply})
         if isinstance(request, CancelGoal) and self.goal is not None and self.ends_on_cancel:
             await self.end("canceled")
 
@@ -163,15 +160,11 @@ class Sidecar:
         self.messages: list[Message] = []
         self.late = 0
         """So many requests about pictures that it comes to too late."""
-        self._server = RouterServer(
+        self.server = RouterServer(
             endpoint, lambda error: {"ok": False, "error": str(error), "code": error.code}
         )
 
-    async def serve(self) -> None:
-        async with self._server:
-            await self._server.serve(self._handle)
-
-    async def _handle(self, peer: Peer, message: Message) -> None:
+    async def handle(self, peer: Peer, message: Message) -> None:
         op = message["op"]
         self.asked.append(op)
         self.messages.append(message)
@@ -204,17 +197,13 @@ class Sidecar:
                 "detections": self.detections,
                 **self.judgement,
             }
-        await self._server.send(peer, reply)
+        await self.server.send(peer, reply)
 
 
 @asynccontextmanager
 async def _served(program: Any) -> AsyncIterator[Any]:
-    task = asyncio.create_task(program.serve())
-    try:
+    async with serving(program.server, program.handle):
         yield program
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
 
 
 @pytest.fixture

@@ -42,7 +42,6 @@ class Story:
         self.endpoint = f"ipc://{folder}/reasoner.sock"
         self.confirmations = Confirmations()
         self.queue = TaskQueue.of_one("x")
-        assert self.queue.running is not None
         self.inbox = self.queue.running.inbox
         self.done: list[ToolCall] = []
 

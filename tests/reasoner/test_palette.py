@@ -238,7 +238,6 @@ def test_a_refusal_names_what_is_offered_and_nothing_else() -> None:
         (QueryScene(question="?"), True, "choose from finish, stop_goal, wait"),
     ):
         refusal = found.check(call, goal_runs=goal_runs)
-        assert refusal is not None
         assert refusal.hint == hint
         assert "locate_in_view" not in str(refusal)
 

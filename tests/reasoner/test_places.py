@@ -21,7 +21,6 @@ def test_scores_of_one_place_add_up_over_looks_from_different_places() -> None:
     # the first again, seen from the side
     places.add(look([1.0, -0.5, math.pi / 2], (0.51, 0.02, 0.5)))
     best = places.best()
-    assert best is not None
     assert best.score == pytest.approx(1.1)
     assert (best.x, best.y) == pytest.approx((0.98, 0.01)), "told from the nearest look"
     assert len(places.known) == 2

@@ -32,8 +32,8 @@ type World = Callable[[ToolCall, int], Outcome]
 type Told = Outcome | Callable[[Any, int], Outcome]
 
 
-def saying(look: Told = FOUND, answer: Told = YES, grab: Told = DONE, other: Told = DONE) -> World:
-    """Return a world that says this of each look, question, grab and other call."""
+def saying(look: Told = FOUND, answer: Told = YES, grab: Told = DONE) -> World:
+    """Return a world that says this of each look, question and grab, and does all else."""
 
     def told(call: ToolCall, before: int) -> Outcome:
         match call:
@@ -44,7 +44,7 @@ def saying(look: Told = FOUND, answer: Told = YES, grab: Told = DONE, other: Tol
             case ExecuteRskill(rskill_id=GRAB.id):
                 says = grab
             case _:
-                says = other
+                says = DONE
         return says if isinstance(says, Outcome) else says(call, before)
 
     return told

@@ -3,7 +3,6 @@ begins nor ends anything.
 """
 
 import asyncio
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -121,9 +120,14 @@ PALETTE = Palette((Skill("lab/grab", "vla", "", ("grasp",)),), can_judge=True)
 
 
 def ask_tool(
-    a_runner: Any, a_sidecar: Any, prepare: Callable[[Any, Any], None], call: ToolCall = ASK
+    a_runner: Any,
+    a_sidecar: Any,
+    call: ToolCall = ASK,
+    *,
+    frame_error: VramError | None = None,
+    **says: Any,
 ) -> Any:
-    """The outcome, and what the sidecar was asked."""
+    """The outcome, and what the sidecar was asked. `says`: fields of the sidecar."""
 
     async def story() -> Any:
         async with (
@@ -132,9 +136,10 @@ def ask_tool(
             RunnerClient(runner.endpoint) as eyes,
             RewardClient(sidecar.endpoint) as reward,
         ):
-            prepare(runner, sidecar)
+            runner.frame_error = frame_error
+            vars(sidecar).update(says)
             past = Past(lambda: eyes.frame("wrist", max_age_ms=1000.0, encoding="png"))
-            if runner.frame_error is None:
+            if frame_error is None:
                 await past.look()
             judge = Judge(reward, past, TASK)
             tools = Tools(RunnerClient(runner.endpoint), None, None, judge=judge, palette=PALETTE)
@@ -145,7 +150,7 @@ def ask_tool(
 
 
 def test_an_opinion_is_said_with_what_it_is_worth(a_runner: Any, a_sidecar: Any) -> None:
-    outcome, asked = ask_tool(a_runner, a_sidecar, lambda runner, sidecar: None)
+    outcome, asked = ask_tool(a_runner, a_sidecar)
     assert outcome.status == "answered"
     assert "progress 0.70, 0.20" in outcome.text
     assert "it looks done (0.90, done from 0.50 on). An opinion about" in outcome.text
@@ -155,12 +160,9 @@ def test_an_opinion_is_said_with_what_it_is_worth(a_runner: Any, a_sidecar: Any)
 
 
 def test_what_the_model_does_not_say_is_not_said(a_runner: Any, a_sidecar: Any) -> None:
-    def says_less(runner: Any, sidecar: Any) -> None:
-        sidecar.judgement = {"progress": [0.4], "success": [], "success_threshold": 0.5}
-
-    outcome, asked = ask_tool(
-        a_runner, a_sidecar, says_less, QueryTaskProgress(task="open the drawer")
-    )
+    less = {"progress": [0.4], "success": [], "success_threshold": 0.5}
+    other = QueryTaskProgress(task="open the drawer")
+    outcome, asked = ask_tool(a_runner, a_sidecar, other, judgement=less)
     assert asked[0]["task"] == "open the drawer"
     assert outcome.text.startswith("'open the drawer': progress 0.40. An opinion")
 
@@ -176,10 +178,7 @@ def test_what_the_model_does_not_say_is_not_said(a_runner: Any, a_sidecar: Any) 
 def test_no_answer_is_never_no_progress(
     a_runner: Any, a_sidecar: Any, error: VramError, status: str, code: str
 ) -> None:
-    def fails(runner: Any, sidecar: Any) -> None:
-        sidecar.error = error
-
-    outcome, _ = ask_tool(a_runner, a_sidecar, fails)
+    outcome, _ = ask_tool(a_runner, a_sidecar, error=error)
     assert (outcome.status, outcome.code) == (status, code)
     assert "progress" not in outcome.data
 
@@ -202,19 +201,13 @@ def test_a_strange_answer_is_an_error(
     a_runner: Any, a_sidecar: Any, judgement: dict[str, Any]
 ) -> None:
     """Regression: a reward model's opinion about three pictures was reported for two."""
-
-    def strange(runner: Any, sidecar: Any) -> None:
-        sidecar.judgement = judgement
-
-    outcome, _ = ask_tool(a_runner, a_sidecar, strange)
+    outcome, _ = ask_tool(a_runner, a_sidecar, judgement=judgement)
     assert (outcome.status, outcome.code) == ("error", "model_error")
 
 
 def test_without_a_fresh_picture_nothing_is_judged(a_runner: Any, a_sidecar: Any) -> None:
-    def dark(runner: Any, sidecar: Any) -> None:
-        runner.frame_error = FrameStale("the camera is dark")
-
-    outcome, asked = ask_tool(a_runner, a_sidecar, dark)
+    dark = FrameStale("the camera is dark")
+    outcome, asked = ask_tool(a_runner, a_sidecar, frame_error=dark)
     assert (outcome.status, outcome.code, asked) == ("no_frame", "frame_stale", [])
 
 

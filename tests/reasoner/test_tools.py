@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import pytest
 
-from tests.support.waiting import play
+from tests.support.waiting import eventually, play
 from vram_arbiter.clients.runner import Goal, RunnerClient
 from vram_arbiter.clients.sidecar.perception import DetectorClient, SceneVlmClient
 from vram_arbiter.reasoner.execution import GOAL_MAX_S, _stands_still, waits_s
@@ -531,8 +531,7 @@ async def test_a_goal_that_is_cancelled_twice_is_waited_for_all_the_same(
     )
     await runner.accepted.wait()
     inbox.put(Said("stop it"))
-    while not runner.cancelled:
-        await asyncio.sleep(0.01)
+    await eventually(lambda: runner.cancelled)
     inbox.put(Cancel("at once"))
     await asyncio.wait({episode}, timeout=0.3)  # what is tested is that time passes without an end
     waits = not episode.done()

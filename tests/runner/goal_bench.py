@@ -10,7 +10,7 @@ from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
 from vram_arbiter.runner.goals.server import GoalServer
-from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, StepOutcome
+from vram_arbiter.runner.protocols import Act, Done, Goal, Hold, InferenceRunner, StepOutcome
 from vram_arbiter.runner.sim.robot import SimRunner
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.schemas.control import ControlMode
@@ -90,19 +90,18 @@ class Bench:
 
 @asynccontextmanager
 async def goals_served(
-    endpoint: str, runner: SimRunner, catalogue: Catalogue, **options: Any
+    endpoint: str,
+    runner: InferenceRunner,
+    catalogue: Catalogue,
+    *,
+    estop_s: float = 60.0,
+    **options: Any,
 ) -> AsyncIterator[GoalServer]:
-    """A goal server on a control thread; `options` are the server's."""
+    """A goal server on a control thread; `options` are the server's. `estop_s`: short only where
+    the loop hangs; a machine that stands still for a second is no such loop."""
     async with ControlThread(runner) as control:
         await control.call(lambda: None)
-        server = GoalServer(
-            endpoint,
-            control,
-            catalogue,
-            SystemClock(),
-            estop_s=60.0,  # a machine that stands still for a second is no loop that hangs
-            **options,
-        )
+        server = GoalServer(endpoint, control, catalogue, SystemClock(), estop_s=estop_s, **options)
         task = asyncio.create_task(server.serve())
         await server.bound.wait()
         try:

@@ -5,15 +5,14 @@ that is played against them.
 import asyncio
 import subprocess
 from collections.abc import Coroutine
-from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.support.paths import ROOT
 from tests.support.prepared import start
 from tests.support.process import ArbiterProcess
 
-ROOT = Path(__file__).parents[2]
 SKILLS = ROOT / "configs/rskills"
 SKILL = SKILLS / "so101-grab/rskill.yaml"
 GRAB = "vram-arbiter/so101-grab"

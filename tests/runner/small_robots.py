@@ -24,6 +24,7 @@ from vram_arbiter.runner.robots.hardware import HardwareRobot, HardwareRunner, M
 from vram_arbiter.runner.robots.kinematic import KinematicTwin
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.safety.estop_latch import EstopLatch
+from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.sensors import Feed, SlotReader
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.schemas.control import ControlMode
@@ -169,6 +170,22 @@ class Twin(KinematicTwin):
             raise RobotFault("motor 2 takes nothing", hint="look at the cable")
         super().send_action(action)
         self.sent.append(action)
+
+
+def twin_runner(
+    twin: Twin,
+    *cameras: SlotReader,
+    clock: Clock,
+    max_age_ms: float = 100.0,
+    make_gate: MakeGate | None = None,
+    **options: Any,
+) -> HardwareRunner:
+    """Return a runner of the twin, by default with a gate that knows the ranges of its joints;
+    `options` are the runner's."""
+    ranges = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
+    readers = [(camera, max_age_ms) for camera in cameras]
+    gate = make_gate or (lambda _: JointRanges(ranges))
+    return hardware_runner(twin, readers, gate, clock=clock, **options)
 
 
 class Nod(SkillBase):

@@ -22,9 +22,8 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import generate_latest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, Nod, Twin, hardware_runner
+from tests.runner.small_robots import FedCamera, Nod, Twin, twin_runner
 from vram_arbiter.runner.protocols import Act, ChunkStart, Goal, Hold, StepOutcome
-from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.sensors.detections import DetectionSlot
 from vram_arbiter.runner.sensors.detector import ContinuousDetector
 from vram_arbiter.runner.skills.base import SkillState
@@ -73,10 +72,7 @@ def main() -> None:
     process.observe()
     clock = ManualClock()
     twin, camera = SlowTwin(clock), FedCamera("front", clock)
-    limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
-    runner = hardware_runner(
-        twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock
-    )
+    runner = twin_runner(twin, camera, clock=clock, max_age_ms=1000.0)
     runner.activate()
     ready = generate_latest(registry).decode()
     skill = Nod(load_manifest(Path(sys.argv[1])), cameras=("front",))
@@ -124,10 +120,7 @@ def main() -> None:
 def some_ticks(clock: ManualClock, exporter: InMemorySpanExporter) -> dict[str, Any]:
     """What a robot's ticks record when one in four is to be traced."""
     twin, camera = Twin(clock), FedCamera("front", clock)
-    limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
-    runner = hardware_runner(
-        twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock
-    )
+    runner = twin_runner(twin, camera, clock=clock, max_age_ms=1000.0)
     runner.spans.share = 0.25
     runner.activate()
     skill = Nod(load_manifest(Path(sys.argv[1])), cameras=("front",))
@@ -170,10 +163,7 @@ class Slow(Nod):
 
 def fall_behind(clock: ManualClock) -> None:
     twin, camera = Twin(clock), FedCamera("wrist", clock, 1000.0)
-    limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
-    runner = hardware_runner(
-        twin, [(camera, 1000.0)], lambda skill: JointRanges(limits), clock=clock
-    )
+    runner = twin_runner(twin, camera, clock=clock, max_age_ms=1000.0)
     runner.activate()
     skill = Slow(load_manifest(Path(sys.argv[1])), on_step=lambda world: clock.advance(0.05))
     skill.state = SkillState.ACTIVE
@@ -198,7 +188,6 @@ def look_in_vain(clock: ManualClock) -> None:
 def collected(reader: InMemoryMetricReader) -> dict[str, Any]:
     """Unit, description, and count (or sum) and sum of each series of each metric."""
     data = reader.get_metrics_data()
-    assert data is not None
     return {
         metric.name: {
             "unit": metric.unit,

@@ -104,7 +104,6 @@ def test_a_freed_block_stays_in_the_cache_until_it_is_emptied_and_then_comes_bac
     folder.now = 0.4
     assert allocate(folder, B, 4 * GB).error is not None
     process = folder.gpu.process(A)
-    assert process is not None
     assert (process.own_bytes, process.on_gpu_bytes) == (0, 6 * GB), (
         "gone from the process, not from the GPU"
     )
@@ -186,7 +185,6 @@ def test_a_gpu_survives_the_daemon_but_not_the_boot():
     assert fakegpu.new_gpu(same, existing, in_use=True) is None
     rebooted = same.model_copy(update={"boot_id": "next"})
     made = fakegpu.new_gpu(rebooted, existing, in_use=True)
-    assert made is not None
     assert (made.boot_id, made.uuid) == ("next", CONFIG.uuid), "a GPU keeps its name"
     larger = CONFIG.model_copy(update={"capacity_bytes": 16 * GB})
     with pytest.raises(ConfigError, match="is in use here"):

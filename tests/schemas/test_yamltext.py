@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.support.deployment import load_robot
+from tests.support.paths import ROOT
 from vram_arbiter.schemas import yamltext
 from vram_arbiter.schemas.config.arbiter import load_config
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import ManifestError, parse_manifest
 from vram_arbiter.schemas.yamltext import DEPTH_MAX, TEXT_MAX_BYTES, parse_yaml, read_yaml
 
-ROOT = Path(__file__).parents[2]
 DEEP_BY_ALIASES = "a: &a " + "[" * 40 + "]" * 40 + "\nb: " + "[" * 40 + "*a" + "]" * 40
 LAUGHS = "a: &a {x: 1, y: 2}\n" + "".join(
     f"{new}: &{new} {{<<: [{', '.join([f'*{old}'] * 20)}]}}\n"

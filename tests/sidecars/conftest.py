@@ -10,12 +10,11 @@ import pytest
 from tests.support.fakegpu_check import check_log
 from tests.support.prepared import start
 from tests.support.processes import children, server_of_imports
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 from tests.support.wire import WireClient
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_gpu
 
 PNG = b"\x89PNG\r\n\x1a\n"  # the echo does not look at it
-PATIENCE_S = 60.0
 MANIFEST = """
 name: test/{name}
 version: 0.1.0

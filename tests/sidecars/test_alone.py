@@ -11,15 +11,15 @@ import sys
 
 import pytest
 
-from tests.support.paths import ROOT, SUPPORT
-from tests.support.waiting import until
+from tests.support.attacks import WITHOUT_A_SESSION
+from tests.support.paths import ROOT
+from tests.support.running import attacked
+from tests.support.waiting import PATIENCE_S, until
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 
 MB = 10**6
-PATIENCE_S = 60.0
-ATTACKER = str(SUPPORT / "attacker.py")
 
 
 def test_without_an_arbiter_models_stay_and_the_last_one_does_not_fit(lone_box):
@@ -46,25 +46,18 @@ def test_a_process_without_a_device_needs_no_gpu(lone_box):
     assert sidecar.detect()["ok"]
 
 
-@pytest.mark.parametrize("mode", ["empties", "maps", "more", "connects"])
-def test_an_attacked_sidecar_serves_others_and_lives(lone_box, mode):
+@pytest.mark.parametrize("attack", WITHOUT_A_SESSION)
+def test_an_attacked_sidecar_serves_others_and_lives(lone_box, attack):
     """Regression: bare connects, an odd identity or frames without end aborted the process, or took
     its memory."""
     sidecar = lone_box.start("detector", "--no-arbiter", device="none")
     assert sidecar.detect()["ok"]
-    path = sidecar.endpoint.removeprefix("ipc://")
-    with subprocess.Popen(
-        [sys.executable, ATTACKER, mode, path], stdout=subprocess.PIPE
-    ) as attacker:
-        try:
-            assert attacker.stdout.readline() == b"under way\n"
-            for _ in range(20):
-                assert sidecar.detect()["ok"]
-            with WireClient(sidecar.endpoint) as another:
-                assert another.ask("ping")["state"] == "resident"
-            assert attacker.poll() is None
-        finally:
-            attacker.kill()
+    with attacked(sidecar.endpoint, attack) as attacker:
+        for _ in range(20):
+            assert sidecar.detect()["ok"]
+        with WireClient(sidecar.endpoint) as another:
+            assert another.ask("ping")["state"] == "resident"
+        assert attacker.process.poll() is None
     assert sidecar.terminate() == 0
 
 

@@ -10,7 +10,9 @@ from typing import Any
 
 import pytest
 
+from tests.support.paths import CONFIGS
 from vram_arbiter.arbiter.host.gpu.fake import make_gpu
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.errors import ModelError, NoGpu, UnsupportedQuantization
 from vram_arbiter.schemas.manifest import Kind, load_manifest
 from vram_arbiter.sidecars.__main__ import main
@@ -20,8 +22,6 @@ from vram_arbiter.sidecars.device.capacity import capacities
 
 pytestmark = pytest.mark.heavy
 
-GIB = 2**30
-CONFIGS = Path(__file__).parents[2] / "configs"
 PAGE = (CONFIGS.parent / "docs/reference/models.md").read_text(encoding="utf-8")
 SHIPPED = sorted(CONFIGS.glob("rskills/*/rskill.yaml"))
 HEAD = (
@@ -215,9 +215,9 @@ DETECTOR = (
 )
 
 
-def put_into_cache(hub: Path, repository: str = "test/model") -> Path:
+def put_into_cache(hub: Path) -> Path:
     """Lay a snapshot into the hub's cache as a download does; return its folder."""
-    place = hub / f"models--{repository.replace('/', '--')}"
+    place = hub / "models--test--model"
     folder = place / "snapshots" / "0123"
     folder.mkdir(parents=True)
     (place / "refs").mkdir()

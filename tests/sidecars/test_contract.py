@@ -19,6 +19,7 @@ import msgpack
 import pytest
 
 from tests.support.fakegpu_check import check_log
+from tests.support.paths import CONFIGS
 from tests.support.pictures import encoded
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
@@ -34,7 +35,6 @@ pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(400)]
 
 PATIENCE_S = 180.0
 GB = 10**9
-CONFIGS = Path(__file__).parents[2] / "configs"
 type Message = dict[str, Any]
 
 
@@ -311,7 +311,6 @@ def test_bad_input_is_a_typed_error_and_costs_the_next_request_nothing(host: Hos
     for junk in (b"", b"\xc1", b"\x80" * 3, b"\xdf\xff\xff\xff\xff", b"\x00" * 1000, *packed):
         host.client.send_raw(junk)
         refused = host.client.receive(PATIENCE_S)
-        assert refused is not None
         assert refused["error"], "without an id in the shape of the field's own servers"
     host.client.send_frames([b"one", b"two", b"three"])
     host.client.send_raw(bytes(IMAGES_MAX_BYTES + 1))

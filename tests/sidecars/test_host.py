@@ -10,13 +10,12 @@ from time import monotonic
 import pytest
 
 from tests.support.processes import children, server_of_imports
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.e2e
 
 GB = 10**9
 MB = 10**6
-PATIENCE_S = 60.0
 
 
 def leases(arbiter):

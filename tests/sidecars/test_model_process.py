@@ -15,7 +15,7 @@ import pytest
 from tests.sidecars.conftest import MANIFEST, PNG
 from tests.sidecars.echo_sidecar import echo_for
 from tests.support.matrix_model import matrix_for
-from tests.support.waiting import until
+from tests.support.waiting import eventually, until
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_gpu
 from vram_arbiter.schemas.errors import BadRequest, ModelError, OutOfMemory, WaitTimeout
 from vram_arbiter.schemas.manifest import parse_manifest
@@ -94,11 +94,6 @@ async def answer_of(model, query: str, begin_s: float = WAIT_S, end_s: float = W
     return reply["answer"]
 
 
-async def holding(place: Place) -> None:
-    while not (place.folder / "holding").exists():
-        await asyncio.sleep(0.01)
-
-
 async def test_its_end_returns_every_byte(place: Place) -> None:
     async with asyncio.timeout(WAIT_S):
         model = await place.start()
@@ -134,7 +129,7 @@ async def test_a_request_that_could_not_begin_in_time_never_does(place: Place) -
         model = await place.start()
         await model.load("")
         hanging = asyncio.create_task(answer_of(model, "hold go"))
-        await holding(place)
+        await eventually((place.folder / "holding").exists)
         with pytest.raises(WaitTimeout, match="busy"):
             await answer_of(model, "late", begin_s=0.05)
         canceled = asyncio.create_task(answer_of(model, "x"))
@@ -166,7 +161,7 @@ async def test_a_caller_that_turns_away_leaves_the_model_in_order(place: Place) 
         model = await place.start()
         await model.load("")
         turning_away = asyncio.create_task(answer_of(model, "hold go"))
-        await holding(place)
+        await eventually((place.folder / "holding").exists)
         turning_away.cancel()
         await asyncio.sleep(0)
         (place.folder / "go").touch()
@@ -181,8 +176,7 @@ async def test_a_load_that_is_not_wanted_any_more_is_ended_at_once(place: Place)
     async with asyncio.timeout(WAIT_S):
         model = await place.start()
         loading = asyncio.create_task(model.load(""))
-        while not place.used():
-            await asyncio.sleep(0.01)
+        await eventually(place.used)
         await model.end(at_once=True)
         with pytest.raises(ModelError, match="ended by SIGKILL"):
             await loading

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_gpu
+from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.errors import ConfigError, NoGpu
 from vram_arbiter.schemas.manifest import parse_manifest
 from vram_arbiter.sidecars.__main__ import main, parser, settings_from
@@ -19,7 +20,6 @@ from vram_arbiter.sidecars.settings import (
 )
 from vram_arbiter.sidecars.weights import Weights
 
-MIB = 2**20
 HEAD = (
     "name: test/model\nversion: 1.2.3\nembodiment_tags: [any]\nchunk_size: 1\n"
     "description: d\nlatency_budget: {per_chunk_ms: 1}\n"

@@ -6,12 +6,11 @@ import signal
 
 import pytest
 
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 from tests.support.wire import WireClient
 
 pytestmark = pytest.mark.e2e
 
-PATIENCE_S = 60.0
 DETECTOR = ("--standby", "--min-residency-s", "0")
 BOTH = "5GB,5GB,100MB"  # each fits, both together do not
 

@@ -36,6 +36,7 @@ SETTLE_S = 150.0  # simulated: every wait, ageing, ladder and verification of th
 PATIENCE_S = 10.0
 MISBELIEF_S = 15.0  # longer than a holder waits for an answer, and the way back to the arbiter
 CHUNK = 8
+FAILURES_MAX = 5
 
 
 @dataclass(slots=True)
@@ -225,7 +226,7 @@ def _let_a_residue_go(world: World, cast: Cast) -> None:
 
 
 # -- many
-def run_many(seeds: Sequence[int], jobs: int, stop_at: int = 5) -> list[Report]:
+def run_many(seeds: Sequence[int], jobs: int) -> list[Report]:
     """All seeds, on `jobs` processes; stops early after some failures."""
     reports: list[Report] = []
     failed = 0
@@ -235,7 +236,7 @@ def run_many(seeds: Sequence[int], jobs: int, stop_at: int = 5) -> list[Report]:
             if report.failure:
                 failed += 1
                 print(f"\n{report.failure}\n", flush=True)
-                if failed >= stop_at:
+                if failed >= FAILURES_MAX:
                     pool.terminate()
                     break
             if len(reports) % 100 == 0:

@@ -173,10 +173,8 @@ async def parked_slowly(
     return lease
 
 
-def run_client(
-    made: World, life: Callable[[SimClient], Awaitable[None]], seconds: float = 60.0
-) -> bool:
-    """Connect a client and run its life. Did it come to its end within so much simulated time?"""
+def run_client(made: World, life: Callable[[SimClient], Awaitable[None]]) -> bool:
+    """Connect a client and run its life. Did it come to its end within a simulated minute?"""
     process = made.spawn("client")
     client = SimClient(made, process)
     done: list[bool] = []
@@ -187,7 +185,7 @@ def run_client(
             done.append(True)
 
     process.loop.enter(lambda: process.loop.create_task(run()))
-    made.run(seconds, lambda: bool(done))
+    made.run(60.0, lambda: bool(done))
     made.kill(process)
     made.kill_daemon()
     return bool(done)

@@ -2,11 +2,12 @@
 
 Plain blocking sockets that speak ZMTP by hand. Every attack ends by itself after the seconds it was
 given, takes a refusal (a cut connection) as a reason to go on with the next connection, and keeps
-at most `CONNECTIONS` of them. Used by hostile tests, the storm and the benchmarks; must not be
-pointed at anything but a server that the caller started.
+at most `CONNECTIONS` of them, or `BARE_CONNECTIONS` that say nothing. Used by hostile tests, the
+storm and the benchmarks; must not be pointed at anything but a server that the caller started.
 """
 
 import contextlib
+import resource
 import socket
 import sys
 import time
@@ -19,6 +20,8 @@ from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.runtime.zmtp import GREETING, READY, encode
 
 CONNECTIONS = 600
+BARE_CONNECTIONS = 2000
+"""More than the files that a process may open by default."""
 BATCH = 64 * 1024
 SEND_TIMEOUT_S = 0.2
 
@@ -88,8 +91,12 @@ def _pour(
             time.sleep(0.001)
 
 
-def _hoard(path: str, end_s: float, open_one: Callable[[str], socket.socket]) -> None:
+def _hoard(
+    path: str, end_s: float, open_one: Callable[[str], socket.socket], most: int = CONNECTIONS
+) -> None:
     """Keep as many connections open as the server, or this process, allows."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     kept: list[socket.socket] = []
     try:
         while time.monotonic() < end_s:
@@ -97,7 +104,7 @@ def _hoard(path: str, end_s: float, open_one: Callable[[str], socket.socket]) ->
                 kept.append(open_one(path))
             except OSError:
                 time.sleep(0.001)
-            if len(kept) > CONNECTIONS:
+            if len(kept) > most:
                 kept.pop(0).close()
     finally:
         for peer in kept:
@@ -127,7 +134,7 @@ def half_messages(path: str, end_s: float) -> None:
 
 def bare_connects(path: str, end_s: float) -> None:
     """Connections that never say anything."""
-    _hoard(path, end_s, lambda path: raw_connection(path, b""))
+    _hoard(path, end_s, lambda path: raw_connection(path, b""), BARE_CONNECTIONS)
 
 
 def silent_peers(path: str, end_s: float) -> None:
@@ -147,10 +154,14 @@ def unknown_keys(path: str, end_s: float) -> None:
 
 
 def empty_maps(path: str, end_s: float) -> None:
-    """Requests of a mebibyte of empty maps."""
-    listed = msgpack.packb({"op": "status", "id": 2, "x": []})[:-1]
-    listed += b"\xdd" + (1_000_000).to_bytes(4) + b"\x80" * 1_000_000
-    _pour(path, end_s, _hello, cycle([encode(listed)]))
+    """Requests of 1 MiB and of 16 MiB of empty maps, and as many values as a server builds."""
+
+    def listed(count: int) -> bytes:
+        request = msgpack.packb({"op": "status", "id": 2, "x": []})[:-1]
+        return encode(request + b"\xdd" + count.to_bytes(4) + b"\x80" * count)
+
+    requests = [listed(1_000_000), listed((16 << 20) - 64), *[listed(4000)] * 100]
+    _pour(path, end_s, _hello, cycle(requests))
 
 
 def slow_reader(path: str, end_s: float) -> None:
@@ -186,6 +197,8 @@ ATTACKS: dict[str, Callable[[str, float], None]] = {
     )
 }
 """By name: `attack(path, end_s)` goes on until `time.monotonic()` is `end_s`."""
+WITHOUT_A_SESSION = ("empty_frames", "empty_maps", "more_for_ever", "bare_connects")
+"""Those that harm a server without sessions, too."""
 
 
 def main() -> None:

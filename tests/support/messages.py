@@ -26,12 +26,12 @@ def no_reason(consumer: str) -> WhyReply:
     return WhyReply(consumer, ())
 
 
-def lease_view(lease_id: str = "L1-1", state: str = "loading") -> LeaseView:
+def lease_view() -> LeaseView:
     """A lease of 1 GiB on GPU-1."""
     return LeaseView(
-        lease_id=lease_id,
+        lease_id="L1-1",
         token=Token(1, 2),
-        state=state,
+        state="loading",
         consumer="detector",
         model="m",
         gpu="GPU-1",

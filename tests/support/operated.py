@@ -78,16 +78,16 @@ async def operate(
     return await goal.result(), truth
 
 
-async def play_program(folder: Path, seed: int, *flags: str) -> tuple[ResultPush, dict[str, Any]]:
+async def play_program(folder: Path, *flags: str) -> tuple[ResultPush, dict[str, Any]]:
     """Run the program with files and socket in a folder; as `operate`."""
     track, file, endpoint = folder / "track.json", folder / "robot.yaml", f"ipc://{folder}/r.sock"
     transport = {"path": str(track), "joints": list(ARM_JOINTS), "step_s": STEP_S}
     file.write_text(FILE.format(transport=json.dumps(transport)), encoding="utf-8")
-    argv = ["sim", "--no-arbiter", "--seed", str(seed), "--teleop", str(file), *flags]
+    argv = ["sim", "--no-arbiter", "--seed", "0", "--teleop", str(file), *flags]
     args = parse([*argv, "--endpoint", endpoint])
     running = asyncio.create_task(args.run(args))
     async with RunnerClient(endpoint) as client:
-        ended = await operate(client, seed, track)
+        ended = await operate(client, 0, track)
         await client.shutdown()
     assert await running == 0
     return ended
@@ -96,4 +96,4 @@ async def play_program(folder: Path, seed: int, *flags: str) -> tuple[ResultPush
 if __name__ == "__main__":
     out = Path(sys.argv[1]).resolve()
     out.mkdir(parents=True, exist_ok=True)
-    print(asyncio.run(play_program(out, 0, "--video", str(out / "episode.mp4"))))
+    print(asyncio.run(play_program(out, "--video", str(out / "episode.mp4"))))

@@ -13,12 +13,12 @@ from vram_arbiter.arbiter.eventlog.logfile import (
 )
 
 
-def write_log(driver: CoreDriver, folder: Path, *, made_at: float = START_S) -> Path:
+def write_log(driver: CoreDriver, folder: Path) -> Path:
     """Everything that the driver posted, as the daemon would have recorded it. Returns the file."""
     header = Header(
-        "0", engine_id(), driver.settings.epoch, 0, "start", 0.0, made_at, driver.settings, None
+        "0", engine_id(), driver.settings.epoch, 0, "start", 0.0, START_S, driver.settings, None
     )
-    engine = Arbiter(driver.settings, made_at)
+    engine = Arbiter(driver.settings, START_S)
     path = folder / file_name(0.0, driver.settings.epoch, 0)
     with path.open("w") as file:
         file.write(header_line(header))

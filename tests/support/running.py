@@ -10,6 +10,9 @@ from typing import IO
 from tests.support.prepared import Forked, start
 from tests.support.waiting import PATIENCE_S
 
+ATTACK_S = 120.0
+"""Longer than what is tested beside it."""
+
 
 class Running:
     """The process, and what it has printed and the test has not read."""
@@ -68,3 +71,13 @@ def running(
             process.wait(PATIENCE_S)
             os.close(output)
             os.close(errors)
+
+
+@contextlib.contextmanager
+def attacked(endpoint: str, attack: str, seconds: float = ATTACK_S) -> Iterator[Running]:
+    """Run one of `attacks.ATTACKS` on a server, for so long or until the end of the block; it has
+    begun."""
+    words = [attack, endpoint.removeprefix("ipc://"), str(seconds)]
+    with running("attacker", words, os.environ) as attacker:
+        assert attacker.line() == "attacking"
+        yield attacker

@@ -23,23 +23,30 @@ class WireClient:
     """One connection. Pushes that arrive while a reply is awaited are kept in `pushes`."""
 
     def __init__(
-        self, endpoint: str, *, kind: int = zmq.DEALER, routing_id: bytes | None = None
+        self,
+        endpoint: str,
+        *,
+        kind: int = zmq.DEALER,
+        routing_id: bytes | None = None,
+        context: "zmq.Context[Any] | None" = None,
     ) -> None:
-        self._context = zmq.Context()
-        self._socket = self._context.socket(kind)
-        self._socket.setsockopt(zmq.LINGER, 0)
+        self._own: zmq.Context[Any] | None = None
+        if context is None:
+            self._own = context = zmq.Context()
+        self.socket: zmq.Socket[bytes] = context.socket(kind)
+        self.socket.setsockopt(zmq.LINGER, 0)
         if routing_id is not None:
-            self._socket.setsockopt(zmq.ROUTING_ID, routing_id)
-        self._socket.connect(endpoint)
+            self.socket.setsockopt(zmq.ROUTING_ID, routing_id)
+        self.socket.connect(endpoint)
         self._id = 0
         self.pushes: list[dict[str, Any]] = []
         self.replies: dict[int | None, dict[str, Any]] = {}
 
     def send_raw(self, payload: bytes) -> None:
-        self._socket.send(payload)
+        self.socket.send(payload)
 
     def send_frames(self, frames: list[bytes]) -> None:
-        self._socket.send_multipart(frames)
+        self.socket.send_multipart(frames)
 
     def send(self, op: str, **fields: Any) -> int:
         """Send a request without waiting for its reply; returns its id. A hello says the
@@ -52,9 +59,9 @@ class WireClient:
 
     def receive(self, timeout_s: float = REPLY_S) -> dict[str, Any] | None:
         """The next message of any kind; None if none comes in time."""
-        if not self._socket.poll(int(timeout_s * 1000)):
+        if not self.socket.poll(int(timeout_s * 1000)):
             return None
-        message = msgpack.unpackb(self._socket.recv())
+        message = msgpack.unpackb(self.socket.recv())
         assert isinstance(message, dict)
         return message
 
@@ -137,8 +144,9 @@ class WireClient:
         return lease
 
     def close(self) -> None:
-        self._socket.close()
-        self._context.term()
+        self.socket.close()
+        if self._own is not None:
+            self._own.term()
 
     def __enter__(self) -> Self:
         return self

@@ -20,8 +20,8 @@ RECORDS = {
 }
 
 
-def filled(folder: Path, boot_id: str = "boot-1") -> int:
-    journal = Journal.open(folder, boot_id)
+def filled(folder: Path) -> int:
+    journal = Journal.open(folder, "boot-1")
     journal.apply(list(RECORDS.items()))
     journal.close()
     return journal.opened.epoch

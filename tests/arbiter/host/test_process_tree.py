@@ -267,11 +267,9 @@ def test_the_cgroup_of_the_second_hierarchy_is_read(tmp_path: Path) -> None:
 
 def test_the_kernel_s_own_text() -> None:
     mine = read_kin(os.getpid())
-    assert mine is not None
     assert (mine.process.pid, mine.parent_pid) == (os.getpid(), os.getppid())
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         kin = read_kin(child.pid)
-        assert kin is not None
         entry = ProcessUse(kin.process, "child", 1)
         (booked,) = on_owners(
             [entry], Lineages().trace([entry]), frozenset({mine.process}), frozenset(), {}

@@ -36,6 +36,7 @@ from vram_arbiter.schemas.wire.replies import HistoryReply, StatusReply
 
 GPU = GpuId("GPU-0")
 STRANGER_UID = 54_321
+FRAMES = 60
 VICTIM = peer_of(os.getpid())
 ATTACKERS = [peer_of(pid, STRANGER_UID, STRANGER_UID) for pid in (os.getppid(), 1)]
 SEED = st.integers(0, 1 << 32)  # draws through Hypothesis would cost more than what they test
@@ -230,12 +231,12 @@ class Plant:
         return {name: len(table) for name, table in tables.items() if table}
 
 
-def attack_table(plant: Plant, draw: random.Random, forger: Forger, frames: int) -> Counter[int]:
+def attack_table(plant: Plant, draw: random.Random, forger: Forger) -> Counter[int]:
     """Hellos, valid requests, mutants, bombs and noise over a few connections of two processes.
     Counts answers per frame."""
     counts: Counter[int] = Counter()
     connections = [(b"c%d" % number, ATTACKERS[number % 2]) for number in range(6)]
-    for number in range(frames):
+    for number in range(FRAMES):
         name, peer = draw.choice(connections)
         match draw.randint(0, 5):
             case 0:
@@ -270,7 +271,7 @@ def learn(forger: Forger, answer: Mapping[str, Any]) -> None:
 def test_nothing_raises_and_nothing_is_left(seed: int) -> None:
     draw = random.Random(seed)
     plant = Plant(real=False)
-    counts = attack_table(plant, draw, Forger(draw), 60)
+    counts = attack_table(plant, draw, Forger(draw))
     assert max(counts) <= 1, "nothing is answered twice"
     plant.everybody_dies()
     assert not plant.leftovers()
@@ -293,7 +294,7 @@ def test_the_core_answers_every_frame_once_and_leaves_others_alone(seed: int) ->
     forger = Forger(draw)
     forger.lease_ids += [lease["lease_id"], "victim"]
     forger.tokens.append(lease["token"])  # stolen
-    counts = attack_table(plant, draw, forger, 60)
+    counts = attack_table(plant, draw, forger)
     assert set(counts) <= {1}, f"every frame is answered exactly once: {counts}"
     core.advance(draw.choice([0.0, 1.0, 40.0]))
     (mine,) = (view for view in to_map(core.status())["leases"] if view["consumer"] == "victim")

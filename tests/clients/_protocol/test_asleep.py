@@ -138,9 +138,7 @@ def left_unheard(link: Wire) -> r.LeaseRecord:
     return record
 
 
-def back_in_contact(
-    link: Wire, record: r.LeaseRecord, *, kept: bool = True, **lease: Any
-) -> list[Message]:
+def back_in_contact(link: Wire, record: r.LeaseRecord, **lease: Any) -> list[Message]:
     """The arbiter is back and hears what is attached again; returns what else it is told."""
     link.connection.connected(link.now)
     link.reply(link.one("hello"), **WELCOME)
@@ -148,7 +146,7 @@ def back_in_contact(
     assert [(item["lease_id"], item["state"]) for item in attach["leases"]] == [
         (record.lease_id, "standby")
     ]
-    link.reply(attach, leases=[{"lease_id": record.lease_id, "kept": kept, "lease": view(**lease)}])
+    link.reply(attach, leases=[{"lease_id": record.lease_id, "kept": True, "lease": view(**lease)}])
     return link.sent()
 
 

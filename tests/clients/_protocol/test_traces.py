@@ -10,6 +10,7 @@ import pytest
 
 from tests.support.leases import Spec
 from tests.support.process import ArbiterProcess
+from tests.support.serving import serving
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
@@ -136,14 +137,13 @@ def test_goals_and_sidecars_requests_carry_it(tmp_path: Path) -> None:
     heard: dict[str, Message] = {}
 
     async def story() -> None:
+        server = RouterServer(f"ipc://{tmp_path}/s.sock", lambda error: error.to_wire())
+
         async def answer(peer: Peer, message: Message) -> None:
             heard[str(message.get("op") or message.get("endpoint"))] = message
             await server.send(peer, {"re": message["id"], "ok": True, "action": []})
 
-        async with RouterServer(
-            f"ipc://{tmp_path}/s.sock", lambda error: error.to_wire()
-        ) as server:
-            serving = asyncio.create_task(server.serve(answer))
+        async with serving(server, answer):
             runner, policy = RunnerClient(server.endpoint), PolicyClient(server.endpoint)
             with tracing.joined(PARENT):
                 await runner.send_goal("a/skill")
@@ -151,7 +151,6 @@ def test_goals_and_sidecars_requests_carry_it(tmp_path: Path) -> None:
             await policy.reset()
             await policy.close()
             await runner.close()
-            serving.cancel()
 
     asyncio.run(story())
     assert heard["goal"]["traceparent"] == heard["get_action"]["traceparent"] == PARENT

@@ -197,7 +197,6 @@ def test_the_terminals_interrupt_reaches_the_program_once(arbiter_daemon: Arbite
         start_new_session=True, preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
     )  # fmt: skip
     try:
-        assert process.stdout is not None
         assert process.stdout.readline() == "up\n"
         os.write(master, b"\x03")
         assert process.stdout.readline() == "int\n"

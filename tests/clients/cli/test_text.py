@@ -268,7 +268,6 @@ def test_fields_of_an_event_have_units(field: dict[str, Any], said: str) -> None
 def test_the_page_folds_the_kinds_that_vramctl_folds() -> None:
     story = (Path(page.__path__[0]) / "static/story.js").read_text()
     listed = re.search(r"const QUIET = new Set\(\[(.*?)\]\);", story, re.DOTALL)
-    assert listed is not None
     assert set(re.findall(r'"(\w+)"', listed[1])) == text.QUIET_KINDS <= NOTES.keys()
 
 

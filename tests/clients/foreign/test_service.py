@@ -117,7 +117,6 @@ def test_the_cgroup_of_a_container_that_runs_is_its_process_s(tools: Path) -> No
     into = f'echo $$ >"{own}/init/cgroup.procs" && echo && exec cat'
     try:
         with subprocess.Popen(["sh", "-c", into], stdin=-1, stdout=-1) as inside:
-            assert inside.stdout is not None
             inside.stdout.readline()
             told = [{"Id": IDENTITY, "State": {"Pid": inside.pid}}]
             (tools / "podman.llm").write_text(json.dumps(told))

@@ -71,8 +71,6 @@ class Answering:
             serving.cancel()
 
     def close(self) -> None:
-        assert self._loop is not None
-        assert self._stopped is not None
         self._loop.call_soon_threadsafe(self._stopped.set)
         self._thread.join(PATIENCE_S)
 

@@ -60,7 +60,6 @@ def false_server(short_folder: Path, name: str) -> Iterator[Heard]:
             return said
 
         try:
-            assert child.stdout is not None
             assert child.stdout.readline() == "listening\n"
             yield heard
         finally:
@@ -125,7 +124,6 @@ def test_nothing_is_said_to_a_false_server_on_a_port(how: str) -> None:
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as child:
-        assert child.stdout is not None
         port = int(child.stdout.readline())
         with pytest.raises(UntrustedServer, match=r"served by uid \d+ \(nobody\)"):
             asyncio.run(ask_sidecar(f"tcp://127.0.0.1:{port}"))

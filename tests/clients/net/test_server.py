@@ -9,6 +9,7 @@ import msgpack
 import pytest
 import zmq
 
+from tests.support.serving import serving
 from tests.support.wire import WireClient
 from vram_arbiter.clients.net.server import Peer, RouterServer, check_free
 from vram_arbiter.clients.runner import RunnerClient
@@ -29,17 +30,14 @@ def test_the_last_answer_reaches_its_peer_though_the_server_ends_behind_it(tmp_p
     endpoint = f"ipc://{tmp_path}/s.sock"
 
     async def answer_and_end() -> None:
-        answered = asyncio.Event()
-        async with RouterServer(endpoint, refused) as server:
+        server, answered = RouterServer(endpoint, refused), asyncio.Event()
 
-            async def handle(peer: Peer, message: Message) -> None:
-                await server.send(peer, {"re": message["id"], "data": ANSWER})
-                answered.set()
+        async def handle(peer: Peer, message: Message) -> None:
+            await server.send(peer, {"re": message["id"], "data": ANSWER})
+            answered.set()
 
-            serving = asyncio.create_task(server.serve(handle))
+        async with serving(server, handle):
             await answered.wait()
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
 
     with WireClient(endpoint) as client:
         request = client.send("ask")
@@ -54,15 +52,15 @@ def test_a_late_answer_is_in_the_envelope_of_its_own_request(tmp_path: Path) -> 
 
     async def asked_twice() -> object:
         waiting: list[tuple[Peer, Message]] = []
-        async with RouterServer(endpoint, refused) as server:
+        server = RouterServer(endpoint, refused)
 
-            async def handle(peer: Peer, message: Message) -> None:
-                waiting.append((peer, message))
-                if len(waiting) == 2:
-                    for asker, request in waiting:
-                        await server.send(asker, {"answer": request["n"]})
+        async def handle(peer: Peer, message: Message) -> None:
+            waiting.append((peer, message))
+            if len(waiting) == 2:
+                for asker, request in waiting:
+                    await server.send(asker, {"answer": request["n"]})
 
-            serving = asyncio.create_task(server.serve(handle))
+        async with serving(server, handle):
             with zmq.Context.instance().socket(zmq.REQ) as socket:
                 for option in (zmq.REQ_CORRELATE, zmq.REQ_RELAXED):
                     socket.setsockopt(option, 1)
@@ -72,8 +70,6 @@ def test_a_late_answer_is_in_the_envelope_of_its_own_request(tmp_path: Path) -> 
                 for n in (1, 2):
                     socket.send(msgpack.packb({"n": n}))
                 answer = await asyncio.to_thread(socket.recv)
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
         return msgpack.unpackb(answer)
 
     assert asyncio.run(asked_twice()) == {"answer": 2}
@@ -86,24 +82,17 @@ def test_words_that_utf8_has_no_bytes_for_reach_the_other_side(tmp_path: Path) -
 
     async def there_and_back() -> tuple[Message, str]:
         heard: list[Message] = []
-        async with RouterServer(endpoint, refused) as server:
+        server = RouterServer(endpoint, refused)
 
-            async def handle(peer: Peer, message: Message) -> None:
-                heard.append(message)
-                error = RobotFault("no file \udcff")
-                answer = (
-                    {"ok": True}
-                    if message["op"] == "ping"
-                    else {"ok": False, "error": error.to_wire()}
-                )
-                await server.send(peer, {"re": message["id"], **answer})
+        async def handle(peer: Peer, message: Message) -> None:
+            heard.append(message)
+            failed = {"ok": False, "error": RobotFault("no file \udcff").to_wire()}
+            answer = {"ok": True} if message["op"] == "ping" else failed
+            await server.send(peer, {"re": message["id"], **answer})
 
-            serving = asyncio.create_task(server.serve(handle))
-            async with RunnerClient(endpoint) as client:
-                with pytest.raises(RobotFault) as raised:
-                    await client.call(CancelGoal(goal_id="smoke \udcff"))
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
+        async with serving(server, handle), RunnerClient(endpoint) as client:
+            with pytest.raises(RobotFault) as raised:
+                await client.call(CancelGoal(goal_id="smoke \udcff"))
         return heard[-1], raised.value.message
 
     stopped, said = asyncio.run(there_and_back())

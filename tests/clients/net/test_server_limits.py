@@ -20,7 +20,8 @@ import zmq
 import zmq.asyncio
 
 from tests.support.prepared import run
-from tests.support.waiting import PATIENCE_S
+from tests.support.serving import serving
+from tests.support.waiting import PATIENCE_S, eventually
 from vram_arbiter.clients.net.server import (
     IMAGES_MAX_BYTES,
     WAITING_MAX,
@@ -61,15 +62,13 @@ class Server:
 
 @asynccontextmanager
 async def router_at(path: Path, **options: Any) -> AsyncIterator[Server]:
-    async with RouterServer(f"ipc://{path}", refused, **options) as router:
-        server = Server(router)
-        task = asyncio.create_task(router.serve(server.handle))
+    router = RouterServer(f"ipc://{path}", refused, **options)
+    server = Server(router)
+    async with serving(router, server.handle):
         try:
             yield server
         finally:
             server.go_on.set()
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
 
 
 class Client:
@@ -246,8 +245,7 @@ def test_a_deleted_socket_file_is_made_again(tmp_path: Path) -> None:
         path = tmp_path / "s.sock"
         async with router_at(path):
             path.unlink()
-            while not path.exists():
-                await asyncio.sleep(0.01)
+            await eventually(path.exists)
             client = Client(path)
             assert (await client.ask({"op": "ping", "id": 1}))["ok"]
             client.close()

@@ -21,7 +21,6 @@ def test_a_seed_is_played_on_a_box(short_folder: Path, tmp_path: Path) -> None:
             assert result == Result(7, box.node_id, result.value)
             assert result.value["seed"] == 7
             (view,) = fleet.views().values()
-            assert view is not None
             assert (view.box, view.resident) == ("n0", {"episodes": "held"})
             (ranked,) = fleet.order(1 << 30, "episodes")
             assert (ranked.node, ranked.reason) == (box.node_id, Reason.RESIDENT)

@@ -69,11 +69,9 @@ def test_it_ends_with_either_end(end: str) -> None:
             if end == "server":
                 peer.close()
             else:
-                assert ssh.stdout is not None
                 ssh.stdout.close()
                 peer.sendall(b"nobody reads it")
             assert ssh.wait(PATIENCE_S) == 0
-        assert ssh.stderr is not None
         assert ssh.stderr.read() == b""
         for stream in (ssh.stdin, ssh.stdout, ssh.stderr):
             if stream is not None:

@@ -71,7 +71,6 @@ def test_a_servers_folder_names_it(tmp_path: Path) -> None:
 )
 def test_a_refusal_says_what_to_do(words: list[str], reason: str, hint: str) -> None:
     error = refusal(tunnel(), words, reached=False)
-    assert error is not None
     assert error.details["reason"] == reason
     assert hint in error.hint
 

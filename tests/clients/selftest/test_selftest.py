@@ -71,7 +71,6 @@ def test_rows_on_a_simulated_gpu(alone: dict[str, str], tmp_path: Path, left_out
 def test_children_of_a_killed_test_die_with_it(alone: dict[str, str]) -> None:
     command = [*PROGRAM, "--gpu", "fake", "--row", "reading", "--row", "stowaway"]
     with subprocess.Popen(command, env=alone, stdout=subprocess.PIPE, text=True) as test:
-        assert test.stdout is not None
         while "reading" not in test.stdout.readline():
             assert test.poll() is None
         holding = until(lambda: len(found := children(test.pid)) == 2 and found)

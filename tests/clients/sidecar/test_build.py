@@ -75,7 +75,6 @@ async def test_a_child_serves_comes_back_and_ends_with_the_block(
 ) -> None:
     client = DetectorClient(f"ipc://{runtime}/eye.sock", connect_timeout_s=PATIENCE_S)
     async with served(client, command):
-        assert client.identity is not None
         first = client.identity["pid"]
         await client.detect(PNG, "cube")
         os.kill(first, signal.SIGKILL)
@@ -92,7 +91,6 @@ async def test_a_child_ends_with_its_parent_that_is_killed(
 ) -> None:
     arguments = [sys.executable, "-c", PARENT, f"ipc://{runtime}/eye.sock", *command]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE) as parent:
-        assert parent.stdout is not None
         pid = int(await asyncio.to_thread(parent.stdout.readline))
         parent.kill()
     await until_ended(pid)
@@ -137,7 +135,6 @@ async def test_what_cannot_start_is_an_error_that_says_what_to_do(
 
 async def test_a_manifest_of_another_kind_is_refused() -> None:
     file = manifest_file("so101-detector")
-    assert file is not None
     assert file.samefile(CONFIGS / "rskills/so101-detector/rskill.yaml")
     assert manifest_file(str(file.parent)) == file
     assert manifest_file("ipc:///run/eye.sock") is None

@@ -9,6 +9,7 @@ import pytest
 
 from tests.support.field_server import PNG, FieldServer
 from tests.support.pictures import encoded
+from tests.support.serving import serving
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.sidecar.field import grounded
 from vram_arbiter.clients.sidecar.perception import (
@@ -197,17 +198,14 @@ async def test_a_server_may_be_replaced_by_one_of_the_other_kind(short_folder: P
     endpoint = f"ipc://{short_folder}/s"
 
     async def ours(client: SceneVlmClient) -> str:
-        async with RouterServer(endpoint, lambda error: {"ok": False}) as server:
+        server = RouterServer(endpoint, lambda error: {"ok": False})
 
-            async def handle(peer: Peer, message: Message) -> None:
-                reply = {"ok": True, "answer": f"{message.get('token')}", "re": message["id"]}
-                await server.send(peer, reply)
+        async def handle(peer: Peer, message: Message) -> None:
+            reply = {"ok": True, "answer": f"{message.get('token')}", "re": message["id"]}
+            await server.send(peer, reply)
 
-            serving = asyncio.create_task(server.serve(handle))
-            try:
-                return await client.query(PNG, "?", token=(1, 2))
-            finally:
-                serving.cancel()
+        async with serving(server, handle):
+            return await client.query(PNG, "?", token=(1, 2))
 
     async with SceneVlmClient(endpoint) as client:
         assert await ours(client) == "[1, 2]"

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from tests.support import prepared
+from tests.support.paths import ROOT
 from tests.support.waiting import until
 from vram_arbiter.runner.__main__ import main
 from vram_arbiter.runner.benchmark.entries import entries_of
@@ -24,7 +25,6 @@ from vram_arbiter.runner.recording.reader import read_frame
 from vram_arbiter.runner.sim.config import SceneConfig
 from vram_arbiter.schemas.errors import UnknownSkill
 
-ROOT = Path(__file__).parents[3]
 FATED = f"scripted:{Path(__file__).parent}/fated.py"
 LOST = f"scripted:{Path(__file__).parents[1]}/lost.py"
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.paths import ROOT
 from vram_arbiter.runner.__main__ import main
 from vram_arbiter.runner.cli import lerobot_eval
 from vram_arbiter.runner.cli.benchmark import add_parser
@@ -17,8 +18,6 @@ from vram_arbiter.runner.cli.lerobot_eval import cells_of, checkpoint_of, flags_
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.manifest import load_manifest
 from vram_arbiter.schemas.manifest.vocabulary import Dtype
-
-ROOT = Path(__file__).parents[3]
 
 
 def report(out: Path) -> Any:

@@ -13,6 +13,7 @@ pytest.importorskip("cv2", reason="needs the runner extra")
 
 from tests.runner.goal_bench import goals_served
 from tests.runner.small_robots import Nod
+from tests.support.waiting import eventually
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.__main__ import parse
 from vram_arbiter.runner.goals.catalogue import Catalogue
@@ -66,8 +67,7 @@ async def test_a_session_by_commands_alone(
         return int(await args.run(args))
 
     early = asyncio.create_task(command("state", "--json"))  # the runner is still starting
-    while "waiting for a runner at" not in caplog.text:
-        await asyncio.sleep(0.01)
+    await eventually(lambda: "waiting for a runner at" in caplog.text)
     async with serving():
         assert await early == 0
         state = json.loads(capsys.readouterr().out)

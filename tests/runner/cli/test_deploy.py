@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from tests.support import prepared
+from tests.support.paths import ROOT
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.cli.deploy import claim
 from vram_arbiter.schemas.config.robot import HalConfig, RobotEnvironment
@@ -25,7 +26,6 @@ from vram_arbiter.schemas.goals import PingRunner
 
 pytestmark = [pytest.mark.anyio, pytest.mark.heavy, pytest.mark.e2e]
 
-ROOT = Path(__file__).parents[3]
 RSKILL = "vram-arbiter/so101-navigate"
 FPS, WIDTH, HEIGHT = 30, 64, 48
 TASK = f"task: {{id: nod, instruction: nod, max_steps: 400}}\nvla: {{id: {RSKILL}}}\n"

@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
+from tests.support.paths import ROOT
 from tests.support.prepared import start
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.errors import UnknownSkill
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
 
-ROOT = Path(__file__).parents[3]
 SKILL = "vram-arbiter/so101-move"
 
 

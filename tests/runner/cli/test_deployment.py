@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.support.paths import ROOT
 from vram_arbiter.runner.__main__ import main, parse
 from vram_arbiter.runner.cli.deployment import make_parts, read_deployment
 from vram_arbiter.runner.cli.servers import remote_sidecars
@@ -22,7 +23,6 @@ from vram_arbiter.schemas.runtime.folders import LockFile
 
 pytestmark = pytest.mark.heavy  # the SO-101's kinematics
 
-ROOT = Path(__file__).parents[3]
 SERVICE = ROOT / "tests/schemas/manifest/samples/ros_service.yaml"
 NAVIGATE = ROOT / "configs/rskills/so101-navigate/rskill.yaml"
 GRAB = ROOT / "configs/rskills/so101-grab/rskill.yaml"

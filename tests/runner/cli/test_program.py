@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.paths import ROOT
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
 from tests.support.waiting import play
@@ -25,8 +26,6 @@ from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.goals import PingRunner
 
 pytestmark = pytest.mark.anyio
-
-ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, Nod, Twin, hardware_runner, moving
+from tests.runner.small_robots import FedCamera, Nod, Twin, moving, twin_runner
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.skill_slot import WITHHELD_IN_A_ROW_MAX
 from vram_arbiter.runner.protocols import DeadlinePolicy, Goal, Hold, SafetyGate, Skill, SkillEnded
@@ -20,7 +20,6 @@ from vram_arbiter.runner.robots.hardware import (
     FIRST_STATE_TRIES,
     HardwareRunner,
 )
-from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.safety.gate import RobotGate
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.sensors import Feed
@@ -45,12 +44,6 @@ PERIOD_S = 1 / 30
 MakeRunner = Callable[..., HardwareRunner]
 
 
-def gate(skill: Skill) -> SafetyGate:
-    return JointRanges(
-        {joint.name: (joint.lower_rad, joint.upper_rad) for joint in so101(simulated=True).joints}
-    )
-
-
 @pytest.fixture
 def twin(clock: Any) -> Twin:
     return Twin(clock)
@@ -64,10 +57,7 @@ def front(clock: Any) -> FedCamera:
 @pytest.fixture
 def make_runner(clock: Any, twin: Twin) -> MakeRunner:
     def build(cameras: Sequence[FedCamera] = (), **options: Any) -> HardwareRunner:
-        readers = [(camera, 100.0) for camera in cameras]
-        return hardware_runner(
-            twin, readers, options.pop("make_gate", gate), clock=clock, **options
-        )
+        return twin_runner(twin, *cameras, clock=clock, **options)
 
     return build
 
@@ -114,7 +104,6 @@ def test_a_skill_sees_cameras_and_moves_the_motors(
     result = tick(runner, clock)
     assert result.action_applied
     assert twin.sent[0].joint_names == ("wrist_flex",)
-    assert seen[0].image_frames is not None
     assert seen[0].image_frames["front"].data == bytes([255, 0, 0, 0, 0, 255])  # inline, untouched
     assert seen[0].diagnostics == {"front": "ok", "joint_state": "ok"}
     tick(runner, clock, 3)
@@ -214,7 +203,6 @@ def test_a_stale_camera_withholds_and_fails_the_goal_if_it_lasts(
         tick(runner, clock, 3)
     front.always = False
     if cause == "ends":
-        assert front.feed is not None
         front.feed.end("end of file")
     clock.advance(0.2)
     asked, sent = skill.taken, len(twin.sent)
@@ -254,7 +242,6 @@ def test_a_camera_that_no_skill_looks_at_stops_nobody(
     front.stop()
     clock.advance(0.2)
     assert tick(runner, clock).action_applied
-    assert runner.world is not None
     assert runner.world.image_frames == {}
 
 
@@ -275,7 +262,6 @@ def test_a_lost_answer_of_the_bus_is_bridged_and_a_silent_bus_withholds(
     assert "no answer from motor 3" in result.safety_violations[0]
     tick(runner, clock, 35)
     assert isinstance(ended[0].error, StateStale)
-    assert runner.world is not None
     assert "joint_state" in runner.world.stale
 
 
@@ -339,7 +325,6 @@ def test_the_emergency_stop_comes_before_anything_else(
     with pytest.raises(EstopRequested):
         begin(runner, nod())
     runner.request_estop("another reason")
-    assert runner.estop is not None
     assert runner.estop.details["reason"] == "a hand is in the way"
 
 
@@ -466,7 +451,7 @@ def test_it_starts_on_a_camera_whose_pictures_take_their_time() -> None:
     clock, over = SystemClock(), threading.Event()
     twin = Twin(clock)
     far = Distant("far", clock, 60_000.0, always=False)
-    runner = hardware_runner(twin, [(far, 60_000.0)], gate, clock=clock, first_data_s=50.0)
+    runner = twin_runner(twin, far, clock=clock, max_age_ms=60_000.0, first_data_s=50.0)
 
     def film() -> None:
         while not over.wait(0.01):
@@ -510,7 +495,7 @@ def test_it_waits_for_a_camera_that_another_program_has_not_started(twin: Twin) 
     """
     clock = ManualClock()
     camera = Later("front", clock, always=False)
-    runner = hardware_runner(twin, [(camera, 100.0)], gate, clock=clock, first_data_s=15.0)
+    runner = twin_runner(twin, camera, clock=clock, first_data_s=15.0)
     runner.activate()
     assert camera.looks == 10
     assert twin.story == ["connect"]
@@ -533,7 +518,6 @@ def test_a_robot_whose_first_answer_is_lost_starts(
 ) -> None:
     twin.answers_lost = FIRST_STATE_TRIES - 1
     runner = started()
-    assert runner.world is not None
     assert runner.world.stale == ()
     runner.deactivate()
 

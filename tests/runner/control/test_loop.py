@@ -229,7 +229,6 @@ def test_ticks_carry_the_callers_trace(clock: Any) -> None:
         result = scripted(clock, [])[0].tick()
     finally:
         context.detach(token)
-    assert result.trace_context is not None
     assert result.trace_context["traceparent"].split("-")[1] == parent.split("-")[1]
     assert scripted(clock, [])[0].tick().trace_context is None
 

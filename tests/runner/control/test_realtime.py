@@ -8,9 +8,9 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
+from tests.support.paths import ROOT
 from vram_arbiter.runner.control.clock import precise_sleep
 from vram_arbiter.runner.control.realtime import (
     NICE,
@@ -21,8 +21,6 @@ from vram_arbiter.runner.control.realtime import (
     make_prompt,
 )
 from vram_arbiter.runner.control.thread import ControlThread
-
-ROOT = Path(__file__).parents[3]
 
 
 def in_thread[T](work: Callable[[], T]) -> T:

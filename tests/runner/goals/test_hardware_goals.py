@@ -14,16 +14,14 @@ from typing import Any
 
 import pytest
 
-from tests.runner.small_robots import FedCamera, Nod, Twin, hardware_runner
+from tests.runner.goal_bench import goals_served
+from tests.runner.small_robots import FedCamera, Nod, Twin, twin_runner
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.__main__ import main
 from vram_arbiter.runner.control.clock import SystemClock
-from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
-from vram_arbiter.runner.goals.server import GoalServer
 from vram_arbiter.runner.protocols import Goal
 from vram_arbiter.runner.robots.hardware import HardwareRunner
-from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.schemas.errors import (
     EstopRequested,
     FrameStale,
@@ -55,7 +53,6 @@ class Told(Nod):
 
     def _wait(self, world: WorldState) -> None:
         if self.prompt == "hang in the step":
-            assert self._loop is not None
             self._loop.call_soon_threadsafe(self.begun.set)
             self.go_on.wait(60)
 
@@ -67,39 +64,23 @@ class Bench:
 
 @pytest.fixture
 def bench(endpoint: str, navigate_manifest: Path) -> Callable[..., Any]:
-    """`estop_s`: short only where the control loop hangs.
-
-    A machine that stands still for a second is no loop that hangs.
-    """
+    """`options` are those of `goals_served`."""
 
     @asynccontextmanager
-    async def serving(estop_s: float = 60.0) -> AsyncIterator[tuple[Bench, RunnerClient]]:
+    async def serving(**options: Any) -> AsyncIterator[tuple[Bench, RunnerClient]]:
         clock = SystemClock()
-        twin, camera, skill = (
-            Twin(clock),
-            FedCamera("front", clock),
-            Told(load_manifest(navigate_manifest)),
-        )
-        limits = {
-            joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints
-        }
-        runner = hardware_runner(
-            twin, [(camera, 100.0)], lambda _: JointRanges(limits), rate_hz=200.0, clock=clock
-        )
+        twin, camera = Twin(clock), FedCamera("front", clock)
+        skill = Told(load_manifest(navigate_manifest))
+        runner = twin_runner(twin, camera, clock=clock, rate_hz=200.0)
         catalogue = Catalogue([skill.manifest], {Kind.ROS_ACTION: lambda manifest: skill})
-        async with ControlThread(runner) as control:
-            server = GoalServer(
-                endpoint, control, catalogue, clock, identity={"robot": "bench"}, estop_s=estop_s
-            )
-            task = asyncio.create_task(server.serve())
-            await server.bound.wait()
+        async with goals_served(
+            endpoint, runner, catalogue, identity={"robot": "bench"}, **options
+        ):
             try:
                 async with RunnerClient(endpoint) as client:
                     yield Bench(twin, camera, skill, runner), client
             finally:
                 skill.go_on.set()
-                server.stopping.set()
-                await task
         assert twin.story[-1] == "disconnect"
 
     return serving

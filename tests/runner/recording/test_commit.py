@@ -164,8 +164,6 @@ def test_one_dataset_has_one_writer(tmp_path: Path) -> None:
     other = subprocess.Popen(
         [sys.executable, "-c", HOLDER, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
-    assert other.stdin is not None
-    assert other.stdout is not None
     with other:
         assert other.stdout.readline() == b"held\n"
         with (

@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from tests.runner.small_robots import FedCamera, Nod, Twin, hardware_runner
+from tests.runner.small_robots import FedCamera, Nod, Twin, twin_runner
 from vram_arbiter.runner.protocols import Act, Done, Goal, GoalTick, Hold, SkillEnded
-from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.skills.base import SkillState
 from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import ModelError
@@ -151,8 +150,7 @@ def test_a_robot_says_only_what_it_was_told_and_nothing_while_it_sees_nothing(
     clock: Any, navigate_manifest: Any
 ) -> None:
     twin, front, follower = Twin(clock), FedCamera("front", clock), Follower()
-    limits = {joint.name: (joint.lower_rad, joint.upper_rad) for joint in twin.description.joints}
-    runner = hardware_runner(twin, [(front, 100.0)], lambda _: JointRanges(limits), clock=clock)
+    runner = twin_runner(twin, front, clock=clock)
     runner.follow(follower)
     runner.activate()
     skill = Nod(load_manifest(navigate_manifest), cameras=("front",))

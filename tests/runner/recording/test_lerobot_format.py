@@ -72,7 +72,6 @@ def arm_tick(index: int) -> GoalTick:
 def recorded_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recorded_set = tmp_path_factory.mktemp("lerobot") / "set"
     recorded_set.mkdir()
-    assert UNITS is not None
     files = LerobotFiles(recorded_set, fps=30, robot=UNITS.robot_type, lerobot=True)
     rows = [row_of(arm_tick(index), ("front",), UNITS) for index in range(FRAMES)]
     features = files.begin(features_of(rows[0]))

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.paths import ROOT
 from tests.support.prepared import Forked, start
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.recording import commit
@@ -24,7 +25,6 @@ pytestmark = [
     pytest.mark.usefixtures("forked_writers"),
 ]
 
-ROOT = Path(__file__).parents[3]
 RSKILL = "vram-arbiter/so101-navigate"
 TRACE = "0af7651916cd43dd8448eb211c80319c"
 SPAN = "b7ad6b7169203331"

@@ -7,23 +7,20 @@ import pytest
 
 pytest.importorskip("cv2", reason="needs the runner extra")
 
-from tests.runner.small_robots import FedCamera, Twin, frame_at, hardware_runner
+from tests.runner.small_robots import FedCamera, Twin, frame_at, twin_runner
 from vram_arbiter.runner.cli.recording import check_recording
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.recording.columns import row_of
 from vram_arbiter.runner.recording.sample import sample_of
 from vram_arbiter.runner.robots.hardware import HardwareRunner
-from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.world import FrameEncoding
 
 
 def runner_with(camera: FedCamera) -> HardwareRunner:
     clock = camera.clock
-    return hardware_runner(
-        Twin(clock), [(camera, 1e6)], lambda skill: JointRanges({}), clock=clock, rate_hz=200.0
-    )
+    return twin_runner(Twin(clock), camera, clock=clock, max_age_ms=1e6, rate_hz=200.0)
 
 
 def test_a_sample_has_the_robots_columns_and_the_pictures_sizes() -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from tests.runner.goal_bench import goals_served
 from tests.runner.skills.policy_bench import Arbiter, Sidecar
 from tests.runner.small_robots import FedCamera, hardware_runner
 from tests.support.waiting import PATIENCE_S, eventually, until
@@ -24,9 +25,7 @@ from vram_arbiter.runner.__main__ import parse
 from vram_arbiter.runner.cli.deployment import DeploymentFile, Parts, make_parts
 from vram_arbiter.runner.cli.makers import operator_of
 from vram_arbiter.runner.control.clock import SystemClock
-from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
-from vram_arbiter.runner.goals.server import GoalServer
 from vram_arbiter.runner.protocols import Goal, GoalTick, SkillEnded
 from vram_arbiter.runner.recording.recorder import DatasetRecorder
 from vram_arbiter.runner.robots.hardware import HardwareRunner
@@ -180,20 +179,10 @@ async def bench_of(
         )
 
     makers = {Kind.VLA: policy, Kind.ROS_ACTION: StandIns(operator_of(parts, 1 / RATE_HZ), JOINTS)}
-    control = await stack.enter_async_context(ControlThread(runner))
     endpoint = f"ipc://{folder}/runner.sock"
     mark = sinks[0].mark if sinks else None
-    server = GoalServer(
-        endpoint, control, Catalogue([grab, MANIFEST], makers), clock, mark=mark, estop_s=60.0
-    )
-    serving = asyncio.create_task(server.serve())
-    await server.bound.wait()
-
-    async def end() -> None:
-        server.stopping.set()
-        await serving
-
-    stack.push_async_callback(end)
+    catalogue = Catalogue([grab, MANIFEST], makers)
+    await stack.enter_async_context(goals_served(endpoint, runner, catalogue, mark=mark))
     client = await stack.enter_async_context(RunnerClient(endpoint))
     made = Bench(bus, parts, runner, client, ticks, sidecar, arbiter)
     rest = [robot.rest_pose_rad[name] for name in JOINTS]

@@ -12,13 +12,14 @@ from cyclonedds.builtin import (
 )
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
-from cyclonedds.idl.types import array, int8, int64, sequence, uint8, uint64
+from cyclonedds.idl.types import array, float64, int8, int64, sequence, uint8, uint64
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from tests.runner.sensors.ros2_node import Time_, struct
+from tests.support.waiting import PATIENCE_S
 
 QUALITY = Qos(
     Policy.Reliability.Reliable(duration(seconds=10)),
@@ -26,7 +27,6 @@ QUALITY = Qos(
     Policy.DataRepresentation(use_cdrv0_representation=True),
 )
 """ROS 2's of services."""
-PATIENCE_S = 60.0
 LATCHED = Qos(
     Policy.Reliability.Reliable(duration(seconds=10)),
     Policy.Durability.TransientLocal,
@@ -34,7 +34,11 @@ LATCHED = Qos(
     Policy.DataRepresentation(use_cdrv0_representation=True),
 )
 
-
+Vector3_ = struct("geometry_msgs.msg.dds_.Vector3_", x=float64, y=float64, z=float64)
+Quaternion_ = struct(
+    "geometry_msgs.msg.dds_.Quaternion_", x=float64, y=float64, z=float64, w=float64
+)
+Transform_ = struct("geometry_msgs.msg.dds_.Transform_", translation=Vector3_, rotation=Quaternion_)
 Gid_ = struct("rmw_dds_common.msg.dds_.Gid_", data=array[uint8, 16])
 NodeEntitiesInfo_ = struct(
     "rmw_dds_common.msg.dds_.NodeEntitiesInfo_",

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from tests.support.dds import NETWORK
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.runner.protocols import Done, Goal, Hold
 from vram_arbiter.runner.ros2.served_skills import RosAction
 from vram_arbiter.runner.sensors.ros2_types import read, write
@@ -28,24 +29,21 @@ from cyclonedds.idl.types import float64, uint16  # noqa: E402
 from tests.runner.ros2.independent import (  # noqa: E402
     CancelRequest_,
     CancelResponse_,
+    Quaternion_,
     Time_,
     action_of,
     server_of,
     struct,
     valid,
 )
+from tests.runner.sensors.ros2_node import Header_  # noqa: E402
 
 DOMAIN = 80
 PREFIX = "nav2_msgs.action.dds_.NavigateToPose_"
 WORLD = WorldState(stamp_ns=0, joint_state=JointState(name=(), position=(), stamp_ns=0))
-PATIENCE_S = 60.0
 
 
-Header_ = struct("std_msgs.msg.dds_.Header_", stamp=Time_, frame_id=str)
 Point_ = struct("geometry_msgs.msg.dds_.Point_", x=float64, y=float64, z=float64)
-Quaternion_ = struct(
-    "geometry_msgs.msg.dds_.Quaternion_", x=float64, y=float64, z=float64, w=float64
-)
 Pose_ = struct("geometry_msgs.msg.dds_.Pose_", position=Point_, orientation=Quaternion_)
 PoseStamped_ = struct("geometry_msgs.msg.dds_.PoseStamped_", header=Header_, pose=Pose_)
 Goal_ = struct("nav2_msgs.action.dds_.NavigateToPose_Goal_", pose=PoseStamped_, behavior_tree=str)
@@ -177,7 +175,6 @@ async def test_a_goal_that_the_server_itself_cancels_is_not_a_success(
 ) -> None:
     try:
         await navigation.start(goal(5.0))
-        assert navigation._client is not None
         await navigation._client.call(
             "/_action/cancel_goal", {"goal_info": {"goal_id": navigation._goal_id}}
         )

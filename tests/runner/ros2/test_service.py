@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from tests.support.dds import NETWORK
+from tests.support.waiting import PATIENCE_S, eventually
 from vram_arbiter.runner.protocols import Done, Goal, Hold
 from vram_arbiter.runner.ros2 import served_skills
 from vram_arbiter.runner.ros2.served_skills import RosService, service_misfit
@@ -29,7 +30,6 @@ from cyclonedds.idl.types import float64, int64, sequence, uint8, uint64  # noqa
 from tests.runner.ros2.independent import server_of, struct, valid  # noqa: E402
 
 DOMAIN = 83
-PATIENCE_S = 60.0
 WORLD = WorldState(stamp_ns=0, joint_state=JointState(name=(), position=(), stamp_ns=0))
 CALL = {"guid": uint64, "seq": int64}
 FILLED = {"structure_needs_at_least_one_member": uint8}
@@ -198,9 +198,7 @@ async def test_a_server_that_is_absent_silent_or_leaves_is_told(
         await skill.finish()  # by the deadline, a person or the emergency stop
         assert "has not answered: the robot may still move" in caplog.text
         leaving = asyncio.create_task(outcome(skill))
-        async with asyncio.timeout(PATIENCE_S):
-            while len(server.requests) < 2:
-                await asyncio.sleep(0.01)
+        await eventually(lambda: len(server.requests) >= 2)
     with pytest.raises(SidecarUnavailable, match="its server is gone"):
         await leaving
     await skill.release()

@@ -12,6 +12,7 @@ import pytest
 
 from tests.runner.goal_bench import goal_bench
 from tests.support.dds import NETWORK
+from tests.support.waiting import PATIENCE_S, eventually
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.planar import planar_pose
 from vram_arbiter.runner.ros2.state_topics import StateTopics
@@ -27,10 +28,9 @@ from cyclonedds.sub import DataReader  # noqa: E402
 from cyclonedds.topic import Topic  # noqa: E402
 from cyclonedds.util import duration  # noqa: E402
 
-from tests.runner.ros2.independent import struct, valid  # noqa: E402
+from tests.runner.ros2.independent import Transform_, struct, valid  # noqa: E402
 from tests.runner.sensors.ros2_node import Header_  # noqa: E402
 
-PATIENCE_S = 60.0
 JointState_ = struct(
     "sensor_msgs.msg.dds_.JointState_",
     header=Header_,
@@ -39,11 +39,6 @@ JointState_ = struct(
     velocity=sequence[float64],
     effort=sequence[float64],
 )
-Vector3_ = struct("geometry_msgs.msg.dds_.Vector3_", x=float64, y=float64, z=float64)
-Quaternion_ = struct(
-    "geometry_msgs.msg.dds_.Quaternion_", x=float64, y=float64, z=float64, w=float64
-)
-Transform_ = struct("geometry_msgs.msg.dds_.Transform_", translation=Vector3_, rotation=Quaternion_)
 Stamped_ = struct(
     "geometry_msgs.msg.dds_.TransformStamped_",
     header=Header_,
@@ -120,9 +115,8 @@ def robot() -> Robot:
 
 async def read(topics: StateTopics, name: str) -> None:
     """Wait until a topic's writer has a reader."""
-    async with asyncio.timeout(PATIENCE_S):
-        while not topics._writers[name].get_publication_matched_status().current_count:
-            await asyncio.sleep(0.01)
+    writer = topics._writers[name]
+    await eventually(lambda: writer.get_publication_matched_status().current_count)
 
 
 async def test_a_state_is_published_once_and_never_when_it_is_stale(

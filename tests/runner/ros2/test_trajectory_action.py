@@ -27,90 +27,27 @@ from vram_arbiter.schemas.manifest import Kind, load_manifest
 pytestmark = [pytest.mark.anyio, pytest.mark.heavy]
 pytest.importorskip("cyclonedds")
 
-from cyclonedds.idl.types import float64, int32, sequence, uint16, uint32  # noqa: E402
-
-from tests.runner.ros2.independent import Commander, Time_, struct  # noqa: E402
+from tests.runner.ros2.independent import Commander, Time_  # noqa: E402
 from tests.runner.ros2.test_state_topics import JointState_, Listener  # noqa: E402
+from tests.runner.ros2.trajectory_messages import (  # noqa: E402
+    PREFIX,
+    Duration_,
+    Feedback_,
+    Goal_,
+    MultiPoint_,
+    MultiTrajectory_,
+    Point_,
+    Result_,
+    Tolerance_,
+    Trajectory_,
+)
 from tests.runner.sensors.ros2_node import Header_  # noqa: E402
 
 DOMAIN = 82
 RATE_HZ = 100.0
 RSKILL = "vram-arbiter/so101-move"
 SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
-PREFIX = "control_msgs.action.dds_.FollowJointTrajectory_"
 
-Duration_ = struct("builtin_interfaces.msg.dds_.Duration_", sec=int32, nanosec=uint32)
-Vector3_ = struct("geometry_msgs.msg.dds_.Vector3_", x=float64, y=float64, z=float64)
-Quaternion_ = struct(
-    "geometry_msgs.msg.dds_.Quaternion_", x=float64, y=float64, z=float64, w=float64
-)
-Transform_ = struct("geometry_msgs.msg.dds_.Transform_", translation=Vector3_, rotation=Quaternion_)
-Twist_ = struct("geometry_msgs.msg.dds_.Twist_", linear=Vector3_, angular=Vector3_)
-Point_ = struct(
-    "trajectory_msgs.msg.dds_.JointTrajectoryPoint_",
-    positions=sequence[float64],
-    velocities=sequence[float64],
-    accelerations=sequence[float64],
-    effort=sequence[float64],
-    time_from_start=Duration_,
-)
-Trajectory_ = struct(
-    "trajectory_msgs.msg.dds_.JointTrajectory_",
-    header=Header_,
-    joint_names=sequence[str],
-    points=sequence[Point_],
-)
-MultiPoint_ = struct(
-    "trajectory_msgs.msg.dds_.MultiDOFJointTrajectoryPoint_",
-    transforms=sequence[Transform_],
-    velocities=sequence[Twist_],
-    accelerations=sequence[Twist_],
-    time_from_start=Duration_,
-)
-MultiTrajectory_ = struct(
-    "trajectory_msgs.msg.dds_.MultiDOFJointTrajectory_",
-    header=Header_,
-    joint_names=sequence[str],
-    points=sequence[MultiPoint_],
-)
-Tolerance_ = struct(
-    "control_msgs.msg.dds_.JointTolerance_",
-    name=str,
-    position=float64,
-    velocity=float64,
-    acceleration=float64,
-)
-Component_ = struct(
-    "control_msgs.msg.dds_.JointComponentTolerance_",
-    joint_name=str,
-    component=uint16,
-    position=float64,
-    velocity=float64,
-    acceleration=float64,
-)
-Goal_ = struct(
-    PREFIX + "Goal_",
-    trajectory=Trajectory_,
-    multi_dof_trajectory=MultiTrajectory_,
-    path_tolerance=sequence[Tolerance_],
-    component_path_tolerance=sequence[Component_],
-    goal_tolerance=sequence[Tolerance_],
-    component_goal_tolerance=sequence[Component_],
-    goal_time_tolerance=Duration_,
-)
-Result_ = struct(PREFIX + "Result_", error_code=int32, error_string=str)
-Feedback_ = struct(
-    PREFIX + "Feedback_",
-    header=Header_,
-    joint_names=sequence[str],
-    desired=Point_,
-    actual=Point_,
-    error=Point_,
-    multi_dof_joint_names=sequence[str],
-    multi_dof_desired=MultiPoint_,
-    multi_dof_actual=MultiPoint_,
-    multi_dof_error=MultiPoint_,
-)
 NO_TIME = Duration_(0, 0)
 
 

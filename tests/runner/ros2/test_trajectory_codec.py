@@ -1,77 +1,20 @@
-"""Trajectory goals and results as another ROS 2 implementation writes and reads them: types and
-codec of Cyclone DDS alone, fields of control_msgs as of ROS 2 Jazzy.
-"""
+"""Trajectory goals and results as another ROS 2 implementation writes and reads them."""
 
 import pytest
 
 pytestmark = pytest.mark.heavy
 pytest.importorskip("cyclonedds")
 
-from cyclonedds.idl.types import float64, int32, sequence, uint16, uint32  # noqa: E402
-
-from tests.runner.ros2.independent import Time_, struct  # noqa: E402
+from tests.runner.ros2.trajectory_messages import (  # noqa: E402
+    Component_,
+    Duration_,
+    Goal_,
+    Result_,
+    Tolerance_,
+)
 from vram_arbiter.runner.sensors.ros2_types import read, write  # noqa: E402
 
 KIND = "control_msgs/action/FollowJointTrajectory_"
-
-
-Duration_ = struct("builtin_interfaces.msg.dds_.Duration_", sec=int32, nanosec=uint32)
-Stamped_ = struct("std_msgs.msg.dds_.Header_", stamp=Time_, frame_id=str)
-Point_ = struct(
-    "trajectory_msgs.msg.dds_.JointTrajectoryPoint_",
-    positions=sequence[float64],
-    velocities=sequence[float64],
-    accelerations=sequence[float64],
-    effort=sequence[float64],
-    time_from_start=Duration_,
-)
-Trajectory_ = struct(
-    "trajectory_msgs.msg.dds_.JointTrajectory_",
-    header=Stamped_,
-    joint_names=sequence[str],
-    points=sequence[Point_],
-)
-MultiPoint_ = struct(
-    "trajectory_msgs.msg.dds_.MultiDOFJointTrajectoryPoint_",
-    transforms=sequence[float64],
-    velocities=sequence[float64],
-    accelerations=sequence[float64],
-    time_from_start=Duration_,
-)
-MultiTrajectory_ = struct(
-    "trajectory_msgs.msg.dds_.MultiDOFJointTrajectory_",
-    header=Stamped_,
-    joint_names=sequence[str],
-    points=sequence[MultiPoint_],
-)
-Tolerance_ = struct(
-    "control_msgs.msg.dds_.JointTolerance_",
-    name=str,
-    position=float64,
-    velocity=float64,
-    acceleration=float64,
-)
-Component_ = struct(
-    "control_msgs.msg.dds_.JointComponentTolerance_",
-    joint_name=str,
-    component=uint16,
-    position=float64,
-    velocity=float64,
-    acceleration=float64,
-)
-Goal_ = struct(
-    "control_msgs.action.dds_.FollowJointTrajectory_Goal_",
-    trajectory=Trajectory_,
-    multi_dof_trajectory=MultiTrajectory_,
-    path_tolerance=sequence[Tolerance_],
-    component_path_tolerance=sequence[Component_],
-    goal_tolerance=sequence[Tolerance_],
-    component_goal_tolerance=sequence[Component_],
-    goal_time_tolerance=Duration_,
-)
-Result_ = struct(
-    "control_msgs.action.dds_.FollowJointTrajectory_Result_", error_code=int32, error_string=str
-)
 
 
 def test_another_codec_reads_a_goal_and_writes_one_that_is_read() -> None:

@@ -196,7 +196,6 @@ def test_a_process_with_one_connection_keeps_it_beside_one_with_many(
         connect_to(endpoint) as honest,
         subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as flood,
     ):
-        assert flood.stdout is not None
         assert flood.stdout.readline()
         connect_to(endpoint).close()  # accepted behind all of them
         honest.send(request("smoke"))
@@ -354,7 +353,6 @@ def test_a_false_runner_is_not_believed_that_the_motors_hold(
         os.chown(folder, nobody, -1)
         argv = [sys.executable, "-c", FALSE_RUNNER, folder, str(nobody)]
         with subprocess.Popen(argv, stdout=subprocess.PIPE) as false:
-            assert false.stdout is not None
             assert false.stdout.readline() == b"listening\n"
             code = main(["estop", "--endpoint", f"ipc://{folder}/runner.sock"])
             assert false.stdout.readline() == b"b''\n"  # nothing was said to it

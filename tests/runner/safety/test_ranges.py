@@ -25,7 +25,6 @@ def test_what_is_inside_passes_unchanged(action: Action) -> None:
 
 def test_a_small_excess_is_clamped_and_said() -> None:
     allowed, problems = JointRanges(LIMITS).check(joints(1.0 + CLAMP_TOLERANCE_RAD / 2, 1.0), WORLD)
-    assert allowed is not None
     assert allowed.joint_targets == ((1.0, 1.0),)
     assert "a: 1.075 rad" in problems[0]
 

@@ -2,8 +2,6 @@
 evicted, back. The model is the test's; time moves only when told.
 """
 
-import asyncio
-import contextlib
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,11 +9,11 @@ from typing import Any
 import pytest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, Twin, hardware_runner
+from tests.runner.small_robots import FedCamera, Twin, twin_runner
+from tests.support.serving import serving
 from vram_arbiter.clients.net.server import RouterServer
 from vram_arbiter.clients.sidecar.perception import DetectorClient
 from vram_arbiter.runner.robots.hardware import HardwareRunner
-from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.sensors.detections import DetectionSlot
 from vram_arbiter.runner.sensors.detector import ContinuousDetector
 from vram_arbiter.schemas.config.robot import DetectorConfig
@@ -76,13 +74,12 @@ def model(clock: ManualClock) -> Model:
 @pytest.fixture
 async def client(short_folder: Path, model: Any) -> AsyncIterator[DetectorClient]:
     endpoint = f"ipc://{short_folder}/d.sock"
-    async with RouterServer(endpoint, unread_reply(model.model_ops)) as server:
-        serving = asyncio.create_task(server.serve(Wire(model, server.send).handle))
-        async with DetectorClient(endpoint) as client:
-            yield client
-        serving.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await serving
+    server = RouterServer(endpoint, unread_reply(model.model_ops))
+    async with (
+        serving(server, Wire(model, server.send).handle),
+        DetectorClient(endpoint) as client,
+    ):
+        yield client
 
 
 @pytest.fixture
@@ -92,12 +89,8 @@ def camera(clock: ManualClock) -> FedCamera:
 
 @pytest.fixture
 def hardware(clock: ManualClock, camera: FedCamera) -> Iterator[HardwareRunner]:
-    hardware = hardware_runner(
-        Twin(clock),
-        [(camera, 100.0)],
-        lambda skill: JointRanges({}),
-        clock=clock,
-        detections=[DetectionSlot("front", 1000.0)],
+    hardware = twin_runner(
+        Twin(clock), camera, clock=clock, detections=[DetectionSlot("front", 1000.0)]
     )
     hardware.activate()
     yield hardware
@@ -117,7 +110,6 @@ def detector(
 def detections_of(hardware: HardwareRunner) -> tuple[list[str], str]:
     """What a tick sees: labels, and the diagnostics of the detector."""
     hardware.tick()
-    assert hardware.world is not None
     labels = [one.label for one in hardware.world.detected_objects]
     return labels, hardware.world.diagnostics["detector:front"]
 
@@ -128,7 +120,6 @@ async def test_detections_are_in_the_world_state_until_old(
     assert detections_of(hardware) == ([], "stale")  # it has not looked yet
     await detector.look()
     assert detections_of(hardware) == (["red cube"], "ok")
-    assert hardware.world is not None
     (cube,) = hardware.world.detected_objects
     assert (cube.box, cube.sensor_id, cube.confidence) == ((1.0, 2.0, 3.0, 4.0), "front", 0.9)
     assert cube.stamp_ns == clock.now_ns()  # when its picture was taken

@@ -41,7 +41,6 @@ def test_what_is_fresh_is_shown_with_its_frame_inline(aggregator: WorldStateAggr
     aggregator.update_image_frame(frame_at(START_NS), START_NS)
     seen = aggregator.snapshot(START_NS + 99 * MS)
     assert seen.diagnostics == {"front": "ok", "wrist": "stale", JOINT_STATE: "ok"}
-    assert seen.image_frames is not None
     assert seen.image_frames["front"].data == b"x"
     assert (seen.images, seen.joint_state.position) == ({"front": "/front"}, (0.5,))
     assert "nothing has come" in aggregator.why("wrist")

@@ -6,12 +6,11 @@ from pathlib import Path
 import pytest
 
 from tests.support.collector import Collector
+from tests.support.paths import ROOT
 from tests.support.prepared import run
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e]
-
-ROOT = Path(__file__).parents[3]
 
 
 def test_each_episode_is_a_span_with_its_ticks(tmp_path: Path) -> None:

@@ -15,12 +15,12 @@ from typing import Any
 
 import pytest
 
+from tests.support.paths import ROOT
 from tests.support.process import ArbiterProcess
 from tests.support.wire import WireClient
 from vram_arbiter.runner.__main__ import main
 
 pytestmark = [pytest.mark.heavy, pytest.mark.nightly, pytest.mark.timeout(1800)]
-ROOT = Path(__file__).parents[3]
 STEPS, CHUNK = 24, 4
 TRAINED_STEPS = 10
 

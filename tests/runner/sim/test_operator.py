@@ -24,7 +24,7 @@ def test_an_operator_takes_a_goal_over_and_grabs(
 ) -> None:
     """It is filmed: docs/teleop.webp."""
     monkeypatch.syspath_prepend(str(PLUGIN))
-    result, truth = asyncio.run(play_program(tmp_path, 0))
+    result, truth = asyncio.run(play_program(tmp_path))
     assert (result["status"], result["data"]["ended_by"]) == ("succeeded", "operator")
     assert truth["held"] == truth["target"]
 

@@ -499,7 +499,6 @@ def test_a_skill_sees_the_cameras_it_wants(make_runner: Make) -> None:
     runner.begin_skill(skill, GOAL, lambda _: None)
     runner.tick()
     frames = skill.seen[0].image_frames
-    assert frames is not None
     assert set(frames) == {"wrist"}
     assert (frames["wrist"].width, frames["wrist"].height) == (32, 24)
 
@@ -542,7 +541,6 @@ def test_navigating_the_real_simulator_and_filming_it(
         assert model is not None
         box = env.seen_objects("front")[env.target].box
         seen = model.ground_point((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
-        assert seen is not None
         assert seen[:2] == pytest.approx((x, y), abs=0.012)
     finally:
         runner.deactivate()

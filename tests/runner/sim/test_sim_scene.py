@@ -142,7 +142,6 @@ def test_middle_of_a_box_lands_on_the_object(scene_3: SimEnv) -> None:
         for name, seen in scene_3.seen_objects("front").items():
             x0, y0, x1, y1 = seen.box
             point = model.ground_point((x0 + x1) / 2, (y0 + y1) / 2)
-            assert point is not None
             assert (
                 math.dist(point[:2], scene_3.ground_truth().objects[name].position_base[:2]) < 0.015
             )

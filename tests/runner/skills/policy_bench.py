@@ -6,6 +6,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 from tests.runner.small_robots import robot_of
+from tests.support.serving import serving
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.sidecar import npy
@@ -73,16 +74,9 @@ class Sidecar:
 
     @asynccontextmanager
     async def served(self, endpoint: str) -> AsyncIterator[None]:
-        async with RouterServer(
-            endpoint, lambda error: {"ok": False, "error": str(error)}
-        ) as server:
-            self.server = server
-            task = asyncio.create_task(server.serve(self.handle))
-            try:
-                yield
-            finally:
-                task.cancel()
-                await asyncio.gather(task, return_exceptions=True)
+        self.server = RouterServer(endpoint, lambda error: {"ok": False, "error": str(error)})
+        async with serving(self.server, self.handle):
+            yield
 
     async def handle(self, peer: Peer, message: Message) -> None:
         import numpy as np

@@ -194,7 +194,6 @@ def test_the_fields_vector_drives_arm_or_base_by_its_mode(panda: Bench) -> None:
     panda.wait(0.5)
     assert panda.tool().xyz - before.xyz == pytest.approx([0, 0, 30 * 0.06 * 0.05], abs=3e-3)
     world = panda.world()
-    assert world.base_pose is not None
     assert world.base_pose.xyz == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
     panda.play(wiring, [[*closing_up, 1.0]] * 30)
     panda.wait(0.5)  # the base has stopped by itself: a command stands for a fifth of a second
@@ -473,7 +472,6 @@ def test_a_goal_of_the_fields_policy_runs_on_the_robot(
     assert [state.shape for state in client.states] == [(16,)] * 4
     assert panda.tool().xyz[0] == pytest.approx(before, abs=5e-3), "the mode gives it to the base"
     world = panda.world()
-    assert world.base_pose is not None
     assert world.base_pose.xyz[0] == pytest.approx(0.2 * (20 / HZ + 0.2), abs=0.03)
     assert client.states[-1][7] > 0.05, "the state tells where the base is"
 

@@ -43,11 +43,9 @@ def world(env: Any) -> WorldState:
     )
 
 
-def drive_until_done(
-    skill: Navigate, env: Any, ticks: int = 600
-) -> tuple[StepOutcome, list[ControlMode]]:
+def drive_until_done(skill: Navigate, env: Any) -> tuple[StepOutcome, list[ControlMode]]:
     modes = []
-    for _ in range(ticks):
+    for _ in range(600):
         outcome = skill.step(world(env))
         if isinstance(outcome, Done):
             return outcome, modes

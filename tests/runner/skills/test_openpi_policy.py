@@ -44,10 +44,10 @@ def chunk(_: Any) -> dict[str, Any]:
 
 
 @asynccontextmanager
-async def at_server(infer: Any = chunk, manifest: str = OPENPI) -> AsyncIterator[Any]:
+async def at_server(infer: Any = chunk) -> AsyncIterator[Any]:
     server = OpenpiServer(infer)
     async with server.served() as url:
-        bench = Bench(parse_manifest(manifest), url, Arbiter())
+        bench = Bench(parse_manifest(OPENPI), url, Arbiter())
         try:
             yield bench, server
         finally:

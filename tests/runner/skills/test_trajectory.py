@@ -265,7 +265,6 @@ def test_a_ros_action_without_a_stand_in_is_refused_with_what_there_is() -> None
 
 def test_types_are_read_as_ros_writes_them_and_packages_count() -> None:
     ros = MOVE.ros_integration
-    assert ros is not None
     long = changed(
         MOVE,
         ros_integration=ros.model_dump()

@@ -62,7 +62,6 @@ def test_every_field_of_the_fields_files_is_read() -> None:
         SensorBackend.GSTREAMER,
     ]
     assert robot.vla is not None
-    assert robot.safety is not None
     assert robot.safety.max_joint_speed_factor == 0.5
     assert RobotEnvironment.model_validate(robot.model_dump(mode="json")) == robot
 

@@ -54,7 +54,6 @@ def test_values_arrive() -> None:
     assert manifest.weights_revision == "0123456789abcdef0123456789abcdef01234567"
     assert manifest.is_commercial_use_allowed
     assert not manifest.is_scaffold_placeholder
-    assert manifest.action_contract is not None
     assert manifest.action_contract.slots is not None
     assert [slot.width for slot in manifest.action_contract.slots] == [6, 1, 3, 1, 1]
     assert manifest.warnings() == []

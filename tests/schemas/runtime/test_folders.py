@@ -125,7 +125,6 @@ def test_a_killed_holder_holds_nothing(tmp_path: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", script, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as child:
-        assert child.stdout is not None
         child.stdout.readline()
         lock = LockFile(path, "the socket")
         with pytest.raises(AlreadyRunning, match="pid 123456789"):

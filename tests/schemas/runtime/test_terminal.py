@@ -62,7 +62,6 @@ def test_ctrl_c_is_no_defect() -> None:
         text=True,
     )
     try:
-        assert process.stdout is not None
         assert process.stdout.readline() == "there\n"
         process.send_signal(signal.SIGINT)
         _, told = process.communicate(timeout=PATIENCE_S)

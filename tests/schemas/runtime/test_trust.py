@@ -46,7 +46,6 @@ def test_the_kernel_names_the_user_who_listens(tmp_path: Path) -> None:
         subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child,
         socket.socket(socket.AF_UNIX) as client,
     ):
-        assert child.stdout is not None
         child.stdout.readline()
         client.connect(str(tmp_path / "s"))
         with pytest.raises(UntrustedServer, match=rf"served by uid {nobody} \(nobody\)") as raised:

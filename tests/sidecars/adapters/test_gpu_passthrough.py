@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from tests.support import prepared
+from tests.support.paths import CONFIGS
 from tests.support.waiting import PATIENCE_S
 from vram_arbiter.schemas.errors import BadRequest, ConfigError
 from vram_arbiter.schemas.manifest import load_manifest
@@ -19,7 +20,6 @@ from vram_arbiter.sidecars.weights import resolve
 
 pytestmark = pytest.mark.heavy  # torch
 
-CONFIGS = Path(__file__).parents[3] / "configs"
 RSKILL = CONFIGS / "diagnostics/gpu-passthrough/rskill.yaml"
 FRONT = "observation.images.front"
 

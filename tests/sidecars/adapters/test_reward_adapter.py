@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.paths import CONFIGS
 from vram_arbiter.schemas.errors import BadRequest, ModelError
 from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
 from vram_arbiter.schemas.sidecar import ScoreOp
@@ -20,7 +21,6 @@ from vram_arbiter.sidecars.weights import Weights, resolve
 
 pytestmark = pytest.mark.heavy
 
-CONFIGS = Path(__file__).parents[3] / "configs"
 SKILL = CONFIGS / "rskills/so101-progress/rskill.yaml"
 TASK = "grab the red cube"
 

@@ -1,9 +1,10 @@
 """The scripted pick: a policy's endpoints without a model."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.support.paths import CONFIGS
 
 pytest.importorskip("cv2")
 import numpy as np
@@ -17,8 +18,6 @@ from vram_arbiter.sidecars.adapters.scripted_pick import ScriptedPickAdapter
 from vram_arbiter.sidecars.weights import resolve
 
 pytestmark = pytest.mark.heavy
-
-CONFIGS = Path(__file__).parents[3] / "configs"
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from tests.sidecars.adapters import policies, tiny_vision
+from tests.support.paths import CONFIGS
 from vram_arbiter.schemas.errors import ModelError
 from vram_arbiter.schemas.manifest import load_manifest
 from vram_arbiter.schemas.manifest.contracts import Quantization
@@ -24,7 +25,6 @@ from vram_arbiter.sidecars.weights import Weights, read_config
 
 pytestmark = [pytest.mark.heavy, pytest.mark.usefixtures("small_networks")]
 
-CONFIGS = Path(__file__).parents[3] / "configs"
 DEVICES = ("cpu", "meta")  # a load, and `vram-sidecar --check`
 WHOLE = "model.safetensors"
 

@@ -12,13 +12,11 @@ import pytest
 
 from tests.support.fakegpu_check import check_log
 from vram_arbiter.arbiter.host.gpu.fake import FakeProbe, make_gpu
+from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.errors import NoGpu, OutOfMemory
 from vram_arbiter.schemas.fakegpu import SimulatedOutOfMemory
 from vram_arbiter.sidecars.device.fake import FakeMemory
 from vram_arbiter.sidecars.device.memory import DeviceMemory, fill
-
-MIB = 2**20
-GIB = 2**30
 
 CONTENDER = """
 import random, sys
@@ -80,11 +78,11 @@ def used(gpu_folder):
     return probe.sample(probe.gpus()[0].id).used_bytes
 
 
-def seconds_until(condition, deadline_s=60.0):
+def seconds_until(condition):
     """Wait until a condition on the GPU's files holds; returns how long it took."""
     began, pause = time.monotonic(), threading.Event()
     while not condition():
-        assert time.monotonic() < began + deadline_s, "it did not happen in time"
+        assert time.monotonic() < began + 60.0, "it did not happen in time"
         pause.wait(0.005)
     return time.monotonic() - began
 

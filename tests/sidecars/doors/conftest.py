@@ -10,16 +10,15 @@ from typing import Any
 import msgpack
 import pytest
 
+from tests.support.paths import ROOT
 from tests.support.prepared import start
 from tests.support.process import ArbiterProcess
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 from tests.support.wire import WireClient
 from vram_arbiter.schemas.runtime.ports import free_port
 
-ROOT = Path(__file__).parents[3]
 GRAB = "vram-arbiter/so101-grab"
 KEY = "a-key-of-this-test"
-PATIENCE_S = 60.0
 GB = 10**9
 
 

@@ -16,15 +16,15 @@ from typing import Any
 
 import pytest
 
-from tests.sidecars.doors.conftest import GRAB, PATIENCE_S, Served
-from tests.support.waiting import until
+from tests.sidecars.doors.conftest import GRAB, Served
+from tests.support.waiting import PATIENCE_S, until
 from vram_arbiter.clients.sidecar import npy
+from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.sidecars.doors.open import CONNECTIONS_MAX
 from vram_arbiter.sidecars.weights import Weights, read_config
 
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(400)]
 CHUNK = 12
-MIB = 2**20
 
 
 @pytest.fixture

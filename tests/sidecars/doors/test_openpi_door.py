@@ -12,18 +12,18 @@ from typing import Any
 import msgpack
 import pytest
 
-from tests.sidecars.doors.conftest import GRAB, KEY, PATIENCE_S, Served
+from tests.sidecars.doors.conftest import GRAB, KEY, Served
 from tests.support.guests import USER
 from tests.support.process import Make
 from tests.support.remote import Remote, wait_for_line
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 from vram_arbiter.clients.sidecar import npy
+from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.runtime.ports import free_port
 from vram_arbiter.sidecars.doors.open import CONNECTIONS_MAX
 
 pytest.importorskip("openpi_client", reason="the dependency group `stock` is not installed")
 pytestmark = [pytest.mark.heavy, pytest.mark.e2e, pytest.mark.timeout(400)]
-MIB = 2**20
 ROWS, JOINTS = 12, 6
 
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vram_arbiter.schemas.defaults import MIB
 from vram_arbiter.schemas.errors import BadRequest, LimitExceeded
 from vram_arbiter.sidecars.doors.pickles import OPCODES_MAX, Array, Record, read
 
@@ -17,7 +18,6 @@ pytestmark = pytest.mark.heavy
 
 NAMES = {"tests.Thing": Record}
 HEAD = b"\x80\x04"
-MIB = 2**20
 
 
 def plain(value: Any) -> Any:

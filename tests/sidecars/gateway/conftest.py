@@ -14,9 +14,9 @@ import yaml
 
 from tests.support.prepared import Forked, start
 from tests.support.process import ArbiterProcess
+from tests.support.waiting import PATIENCE_S
 from vram_arbiter.schemas.yamltext import TEXT_MAX_BYTES
 
-PATIENCE_S = 60.0
 KEY = "none-is-checked"
 
 

@@ -13,9 +13,9 @@ pytest.importorskip("aiohttp", reason="the extra `gateway`")
 import httpx
 
 from tests.clients.foreign.test_service import SYSTEMCTL
-from tests.sidecars.gateway.conftest import PATIENCE_S, GatewayProcess
+from tests.sidecars.gateway.conftest import GatewayProcess
 from tests.support.process import ArbiterProcess
-from tests.support.waiting import eventually
+from tests.support.waiting import PATIENCE_S, eventually
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.schemas.runtime.ports import free_port

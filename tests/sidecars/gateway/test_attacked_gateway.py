@@ -19,10 +19,10 @@ import pytest
 
 pytest.importorskip("aiohttp", reason="the extra `gateway`")
 
-from tests.sidecars.gateway.conftest import PATIENCE_S, GatewayProcess, stand_in
+from tests.sidecars.gateway.conftest import GatewayProcess, stand_in
 from tests.support.process import ArbiterProcess
 from tests.support.processes import rss_bytes
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.e2e
 MIB = 1 << 20

@@ -16,13 +16,13 @@ pytest.importorskip("aiohttp", reason="the extra `gateway`")
 
 import aiohttp
 
-from tests.sidecars.gateway.conftest import KEY, PATIENCE_S, GatewayProcess, stand_in
+from tests.sidecars.gateway.conftest import KEY, GatewayProcess, stand_in
 from tests.support.collector import Collector
 from tests.support.leases import view_of
 from tests.support.prepared import start
 from tests.support.process import ArbiterProcess
 from tests.support.processes import alive, rss_bytes
-from tests.support.waiting import eventually
+from tests.support.waiting import PATIENCE_S, eventually
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.reasoner.llm.config import LlmConfig
 from vram_arbiter.reasoner.llm.http import JsonHttp

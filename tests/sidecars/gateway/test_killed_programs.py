@@ -12,10 +12,10 @@ pytest.importorskip("aiohttp", reason="the extra `gateway`")
 
 import aiohttp
 
-from tests.sidecars.gateway.conftest import PATIENCE_S, GatewayProcess, stand_in
+from tests.sidecars.gateway.conftest import GatewayProcess, stand_in
 from tests.support.process import ArbiterProcess
 from tests.support.processes import alive
-from tests.support.waiting import eventually
+from tests.support.waiting import PATIENCE_S, eventually
 from vram_arbiter.clients.sync import Client
 
 pytestmark = [pytest.mark.anyio, pytest.mark.e2e, pytest.mark.nightly]

@@ -14,11 +14,11 @@ import pytest
 pytest.importorskip("aiohttp", reason="the extra `gateway`")
 pytest.importorskip("xllamacpp", reason="llama.cpp has no wheel here")
 
-from tests.sidecars.gateway.conftest import KEY, PATIENCE_S, GatewayProcess
+from tests.sidecars.gateway.conftest import KEY, GatewayProcess
 from tests.support.leases import view_of
 from tests.support.process import ArbiterProcess
 from tests.support.tiny_gguf import write_gguf
-from tests.support.waiting import eventually
+from tests.support.waiting import PATIENCE_S, eventually
 from vram_arbiter.clients.sync import Client
 
 # test_gateway has the same with stand-ins

@@ -17,13 +17,13 @@ import pytest
 from tests.support.process import ArbiterProcess
 from vram_arbiter.clients.cli.installation.site import Site, site_of_user
 from vram_arbiter.schemas.config.gateway import load_gateway, load_keys
+from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.errors import ArbiterUnreachable, ConfigError
 from vram_arbiter.schemas.runtime import procfs
 from vram_arbiter.sidecars.gateway import setup
 from vram_arbiter.sidecars.gateway.__main__ import main
 from vram_arbiter.sidecars.gateway.setup import Found, FoundServer, config_text
 
-GIB = 1 << 30
 KEYS_FILE = Path("/etc/vram-arbiter/gateway-keys.yaml")
 GPU = {"gpu": "GPU-0", "name": "RTX", "capacity_bytes": 8 * GIB, "processes": []}
 OLLAMA = FoundServer(

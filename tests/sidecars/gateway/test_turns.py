@@ -32,7 +32,6 @@ def test_among_equals_the_key_is_next_that_used_least() -> None:
     order = []
     for now in (1.0, 2.0, 3.0):
         request = turns.next(now)
-        assert request is not None
         order.append(request.key)
         assert turns.next(now) is None  # one at a time
         turns.leave(request, now + 1.0)

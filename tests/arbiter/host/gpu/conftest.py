@@ -78,7 +78,6 @@ def half_a_letter() -> Iterator[int]:
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
     ) as child:
-        assert child.stdout is not None
         assert child.stdout.readline() == b"named\n"
         assert b"(abcdefghijklmn\xc3)" in Path(f"/proc/{child.pid}/stat").read_bytes()
         yield child.pid

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.waiting import until
+from tests.support.waiting import eventually, until
 from vram_arbiter.clients.observer.hooks.actions import post, read_headers, retry_after_s
 from vram_arbiter.clients.observer.hooks.command import run_command
 from vram_arbiter.clients.observer.hooks.events import Delivery
@@ -115,8 +115,7 @@ def test_a_canceled_command_is_killed(tmp_path: Path) -> None:
     async def test() -> None:
         script = f"echo $$ > {tmp_path}/new; mv {tmp_path}/new {tmp_path}/pid; sleep 600"
         running = asyncio.create_task(run_command(["sh", "-c", script], b"", {}, 600.0))
-        while not (tmp_path / "pid").exists():
-            await asyncio.sleep(0.005)
+        await eventually((tmp_path / "pid").exists)
         running.cancel()
         with pytest.raises(asyncio.CancelledError):
             await running

@@ -225,7 +225,6 @@ def test_two_users_leave_open_pages_to_root(port: int) -> None:
                     stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
                 )
             )  # fmt: skip
-            assert user.stdout is not None
             told += [user.stdout.readline().strip() for _ in range(count)]
         assert told == ["200"] * 10 + ["503"]
         for _ in range(2):
@@ -319,7 +318,6 @@ def test_a_start_that_is_refused(serving_arbiter: ArbiterProcess, port: int) -> 
         (f"127.0.0.1:{port}", f"cannot listen on 127.0.0.1:{port}"),
     ):
         refused = ObserverProcess(serving_arbiter, ("--http", given)).spawn()
-        assert refused.process is not None
         assert refused.process.wait(REPLY_S) == 2
         assert words in refused.log
 

@@ -122,7 +122,6 @@ def test_sigterm_loses_nothing_and_the_trace_is_the_starters() -> None:
     with Collector() as collector:
         given = {"TRACEPARENT": f"00-{TRACE}-{PARENT}-01", **collector.environ()}
         process = program("print('up', flush=True); signal.pause()", **given)
-        assert process.stdout is not None
         assert process.stdout.readline() == "up\n"
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=PATIENCE_S)
