@@ -60,7 +60,7 @@ def add_parser(commands: Commands) -> argparse.ArgumentParser:
     )
     bench.add_argument(
         "--policy", action="append", default=[],
-        help="random, expert (grabs), scripted:MODULE or scripted:FILE.py; repeatable",
+        help="random, expert (grabs), scripted:FILE; repeatable",
     )  # fmt: skip
     bench.add_argument(
         "--episodes", type=positive_int, default=10, help="episodes per cell; default 10"

@@ -1,4 +1,4 @@
-"""Policies without a model, as skills: `random`, `expert`, `scripted:MODULE`, `scripted:FILE.py`.
+"""Policies without a model, as skills: `random`, `expert`, `scripted:FILE`.
 
 They are the floor and the ceiling of a benchmark. A script has a function `make(env, seed)` that
 returns `act(world)`: called once a tick with the world state, it returns an `Action`, or joint
@@ -8,13 +8,10 @@ script's code is foreign: what it raises becomes ModelError.
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import sys
+import runpy
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from vram_arbiter.runner.protocols import Act, Done, Goal, SkillKey, StepOutcome
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
@@ -71,8 +68,8 @@ class PolicySkill:
 
 
 def policy_of(name: str) -> MakeStep:
-    """Return what begins a policy. Raises ConfigError for an unknown one, or a module that cannot
-    be imported.
+    """Return what begins a policy. Raises ConfigError for an unknown one, or a script that cannot
+    be run.
     """
     if name == RANDOM:
         return lambda env, seed: lambda world: env.sample()
@@ -80,13 +77,11 @@ def policy_of(name: str) -> MakeStep:
         return _expert
     where = name.removeprefix(SCRIPTED)
     if not name.startswith(SCRIPTED) or not where:
-        raise ConfigError(
-            f"unknown policy {name!r}", hint="random, expert, scripted:MODULE or scripted:FILE.py"
-        )
-    make: MakeStep | None = getattr(_load(where), "make", None)
-    if make is None or not callable(make):
+        raise ConfigError(f"unknown policy {name!r}", hint="random, expert or scripted:FILE")
+    make = _make_of(where)
+    if not callable(make):
         raise ConfigError(f"{where} has no function `make(env, seed)`")
-    return make
+    return cast("MakeStep", make)
 
 
 def _expert(env: ArmEnvironment, seed: int) -> Step:
@@ -106,21 +101,13 @@ def _expert(env: ArmEnvironment, seed: int) -> Step:
     return act
 
 
-def _load(where: str) -> ModuleType:
+def _make_of(where: str) -> object:
+    """Return what a script calls `make`; None: nothing."""
+    if not Path(where).is_file():
+        raise ConfigError(f"script not found: {where}")
     try:
-        if not where.endswith(".py"):
-            return importlib.import_module(where)
-        path = Path(where)
-        spec = importlib.util.spec_from_file_location(f"policy_{path.stem}", path)
-        if spec is None or spec.loader is None or not path.is_file():
-            raise ConfigError(f"script not found: {where}")
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[spec.name] = module  # dataclasses and pickle look there
-        spec.loader.exec_module(module)
-    except ConfigError:
-        raise
+        return runpy.run_path(where, run_name=f"policy_{Path(where).stem}").get("make")
     except Exception as error:
         raise ConfigError(
-            f"the policy {where} cannot be imported: {type(error).__name__}: {error}"
+            f"the policy {where} cannot be run: {type(error).__name__}: {error}"
         ) from error
-    return module
