@@ -52,13 +52,15 @@ from vram_arbiter.runner.cli.recording import (
 from vram_arbiter.runner.cli.servers import connect_servers, remote_sidecars
 from vram_arbiter.runner.cli.watching import Watch, slots_of, watches, watching
 from vram_arbiter.runner.control.clock import SystemClock
+from vram_arbiter.runner.control.loop import ControlLoop
 from vram_arbiter.runner.control.realtime import leaves_room, make_prompt
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue, read_manifests, sidecar_endpoint
 from vram_arbiter.runner.goals.server import GoalServer
 from vram_arbiter.runner.gpu_lease import DECODER_BYTES, DECODING, cuda_uuid, gpu_lease
 from vram_arbiter.runner.protocols import DeadlinePolicy, GoalData
-from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
+from vram_arbiter.runner.robots.hardware import HardwareRobot, HardwareRunner
+from vram_arbiter.runner.safety.estop_latch import EstopLatch
 from vram_arbiter.runner.safety.estop_mark import EstopMark
 from vram_arbiter.runner.sensors.ros2_estop import estop_topic, listened_topic
 from vram_arbiter.runner.skills import teleop
@@ -250,24 +252,29 @@ class Deploy:
         }
 
     def _runner(self, parts: Parts, mark: EstopMark) -> HardwareRunner:
-        def latch(reason: str) -> None:
+        def stopped(reason: str) -> None:
             parts.gate.trip(reason)
             mark.leave(reason)
 
-        robot = self._file.robot
+        robot, latch = self._file.robot, EstopLatch(stopped)
         ages = {sensor.sensor_id: sensor.max_age_ms for sensor in robot.sensors}
-        return hardware_runner(
+        hardware = HardwareRobot(
             parts.hal,
             [(reader, ages[reader.sensor_id]) for reader in parts.readers],
             lambda skill: parts.gate.for_skill(skill.manifest, skill.cameras),
+            clock=self._clock,
+            latch=latch,
+            topics={s.sensor_id: s.publish_topic for s in robot.sensors if s.publish_topic},
+            detections=slots_of(self._watches),
+            sync=robot.sync,
+        )
+        return ControlLoop(
+            hardware,
             rate_hz=robot.rate_hz,
             deadline_policy=DeadlinePolicy(robot.deadline_overrun_policy),
             latency_budget_ms=robot.latency_budget_ms,
             clock=self._clock,
-            topics={s.sensor_id: s.publish_topic for s in robot.sensors if s.publish_topic},
-            detections=slots_of(self._watches),
-            sync=robot.sync,
-            on_estop=latch,
+            latch=latch,
         )
 
     async def _start(

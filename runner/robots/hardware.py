@@ -12,11 +12,10 @@ import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
 
-from vram_arbiter.runner.control.clock import Clock, SystemClock
+from vram_arbiter.runner.control.clock import Clock
 from vram_arbiter.runner.control.loop import ControlLoop
 from vram_arbiter.runner.control.robot import Applied, Sensed, StaleInput
 from vram_arbiter.runner.protocols import (
-    DeadlinePolicy,
     GoalData,
     SafetyGate,
     SensorReader,
@@ -338,46 +337,3 @@ class HardwareRobot:
 
 
 HardwareRunner = ControlLoop[HardwareRobot]
-
-
-def hardware_runner(
-    hal: HalBase,
-    readers: Sequence[tuple[SensorReader, float]],
-    make_gate: MakeGate,
-    *,
-    rate_hz: float = 30.0,
-    deadline_policy: DeadlinePolicy = DeadlinePolicy.WARN,
-    latency_budget_ms: float | None = None,
-    clock: Clock | None = None,
-    topics: Mapping[str, str] | None = None,
-    detections: Sequence[DetectionSlot] = (),
-    sync: SyncConfig | None = None,
-    on_estop: Callable[[str], None] | None = None,
-    first_data_s: float = FIRST_DATA_S,
-) -> HardwareRunner:
-    """Compose a control loop on hardware.
-
-    Args: as for `HardwareRobot` and `ControlLoop`; `on_estop` is told of an emergency stop at once,
-    on the thread that asks for it.
-    """
-    clock = clock or SystemClock()
-    latch = EstopLatch(on_estop)
-    robot = HardwareRobot(
-        hal,
-        readers,
-        make_gate,
-        clock=clock,
-        latch=latch,
-        topics=topics,
-        detections=detections,
-        sync=sync,
-        first_data_s=first_data_s,
-    )
-    return ControlLoop(
-        robot,
-        rate_hz=rate_hz,
-        deadline_policy=deadline_policy,
-        latency_budget_ms=latency_budget_ms,
-        clock=clock,
-        latch=latch,
-    )

@@ -4,13 +4,26 @@ bus can fail, a skill that nods.
 
 import asyncio
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from vram_arbiter.runner.control.clock import Clock
-from vram_arbiter.runner.protocols import Act, Done, Goal, Joint, RobotDescription, StepOutcome
+from vram_arbiter.runner.control.loop import ControlLoop
+from vram_arbiter.runner.protocols import (
+    Act,
+    DeadlinePolicy,
+    Done,
+    Goal,
+    Joint,
+    RobotDescription,
+    SensorReader,
+    StepOutcome,
+)
+from vram_arbiter.runner.robots.base import HalBase
+from vram_arbiter.runner.robots.hardware import HardwareRobot, HardwareRunner, MakeGate
 from vram_arbiter.runner.robots.kinematic import KinematicTwin
 from vram_arbiter.runner.robots.so101 import so101
+from vram_arbiter.runner.safety.estop_latch import EstopLatch
 from vram_arbiter.runner.sensors import Feed, SlotReader
 from vram_arbiter.runner.skills.base import SkillBase
 from vram_arbiter.schemas.control import ControlMode
@@ -23,6 +36,25 @@ def robot_of(*joints: str) -> RobotDescription:
     """A robot of which only the names of its joints are known."""
     free = tuple(Joint(name, -math.inf, math.inf, math.inf) for name in joints)
     return RobotDescription("this world", free, {})
+
+
+def hardware_runner(
+    hal: HalBase,
+    readers: Sequence[tuple[SensorReader, float]],
+    make_gate: MakeGate,
+    *,
+    clock: Clock,
+    rate_hz: float = 30.0,
+    deadline_policy: DeadlinePolicy = DeadlinePolicy.WARN,
+    on_estop: Callable[[str], None] | None = None,
+    **of_robot: Any,
+) -> HardwareRunner:
+    """A control loop on hardware, composed as `vram-runner deploy` does."""
+    latch = EstopLatch(on_estop)
+    robot = HardwareRobot(hal, readers, make_gate, clock=clock, latch=latch, **of_robot)
+    return ControlLoop(
+        robot, rate_hz=rate_hz, deadline_policy=deadline_policy, clock=clock, latch=latch
+    )
 
 
 def moving(**targets: float) -> Action:

@@ -22,9 +22,8 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import generate_latest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, Nod, Twin
+from tests.runner.small_robots import FedCamera, Nod, Twin, hardware_runner
 from vram_arbiter.runner.protocols import Act, ChunkStart, Goal, Hold, StepOutcome
-from vram_arbiter.runner.robots.hardware import hardware_runner
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.sensors.detections import DetectionSlot
 from vram_arbiter.runner.sensors.detector import ContinuousDetector

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, Nod, Twin, moving
+from tests.runner.small_robots import FedCamera, Nod, Twin, hardware_runner, moving
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.skill_slot import WITHHELD_IN_A_ROW_MAX
 from vram_arbiter.runner.protocols import DeadlinePolicy, Goal, Hold, SafetyGate, Skill, SkillEnded
@@ -19,7 +19,6 @@ from vram_arbiter.runner.robots.hardware import (
     FIRST_DATA_SLICE_S,
     FIRST_STATE_TRIES,
     HardwareRunner,
-    hardware_runner,
 )
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.safety.gate import RobotGate

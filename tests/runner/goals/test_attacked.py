@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.runner.small_robots import FedCamera, Nod, Twin
+from tests.runner.small_robots import FedCamera, Nod, Twin, hardware_runner
 from tests.support.paths import SUPPORT
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
 from vram_arbiter.runner.goals.server import GoalServer
-from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
+from vram_arbiter.runner.robots.hardware import HardwareRunner
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.schemas.errors import EstopRequested
 from vram_arbiter.schemas.manifest import Kind, load_manifest

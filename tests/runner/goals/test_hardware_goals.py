@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from tests.runner.small_robots import FedCamera, Nod, Twin
+from tests.runner.small_robots import FedCamera, Nod, Twin, hardware_runner
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.runner.__main__ import main
 from vram_arbiter.runner.control.clock import SystemClock
@@ -22,7 +22,7 @@ from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.goals.catalogue import Catalogue
 from vram_arbiter.runner.goals.server import GoalServer
 from vram_arbiter.runner.protocols import Goal
-from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
+from vram_arbiter.runner.robots.hardware import HardwareRunner
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.schemas.errors import (
     EstopRequested,

@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from tests.runner.small_robots import FedCamera, Nod, Twin
+from tests.runner.small_robots import FedCamera, Nod, Twin, hardware_runner
 from vram_arbiter.runner.protocols import Act, Done, Goal, GoalTick, Hold, SkillEnded
-from vram_arbiter.runner.robots.hardware import hardware_runner
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.skills.base import SkillState
 from vram_arbiter.schemas.control import ControlMode

@@ -7,13 +7,13 @@ import pytest
 
 pytest.importorskip("cv2", reason="needs the runner extra")
 
-from tests.runner.small_robots import FedCamera, Twin, frame_at
+from tests.runner.small_robots import FedCamera, Twin, frame_at, hardware_runner
 from vram_arbiter.runner.cli.recording import check_recording
 from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.control.thread import ControlThread
 from vram_arbiter.runner.recording.columns import row_of
 from vram_arbiter.runner.recording.sample import sample_of
-from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
+from vram_arbiter.runner.robots.hardware import HardwareRunner
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.world import FrameEncoding

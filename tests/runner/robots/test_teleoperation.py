@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from tests.runner.skills.policy_bench import Arbiter, Sidecar
-from tests.runner.small_robots import FedCamera
+from tests.runner.small_robots import FedCamera, hardware_runner
 from tests.support.waiting import PATIENCE_S, eventually, until
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.clients.sidecar.policy import PolicyClient
@@ -29,7 +29,7 @@ from vram_arbiter.runner.goals.catalogue import Catalogue
 from vram_arbiter.runner.goals.server import GoalServer
 from vram_arbiter.runner.protocols import Goal, GoalTick, SkillEnded
 from vram_arbiter.runner.recording.recorder import DatasetRecorder
-from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
+from vram_arbiter.runner.robots.hardware import HardwareRunner
 from vram_arbiter.runner.robots.so101 import RANGES_RAD, so101
 from vram_arbiter.runner.robots.teleoperators import Keyboard, make_teleoperator
 from vram_arbiter.runner.skills.ros_standins import StandIns

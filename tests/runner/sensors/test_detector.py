@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, Twin
+from tests.runner.small_robots import FedCamera, Twin, hardware_runner
 from vram_arbiter.clients.net.server import RouterServer
 from vram_arbiter.clients.sidecar.perception import DetectorClient
-from vram_arbiter.runner.robots.hardware import HardwareRunner, hardware_runner
+from vram_arbiter.runner.robots.hardware import HardwareRunner
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.sensors.detections import DetectionSlot
 from vram_arbiter.runner.sensors.detector import ContinuousDetector

@@ -3,9 +3,8 @@
 import pytest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, Twin, frame_at
+from tests.runner.small_robots import FedCamera, Twin, frame_at, hardware_runner
 from tests.support.waiting import until
-from vram_arbiter.runner.robots.hardware import hardware_runner
 from vram_arbiter.runner.safety.ranges import JointRanges
 from vram_arbiter.runner.sensors.synced import read_together
 from vram_arbiter.schemas.config.robot import SyncConfig

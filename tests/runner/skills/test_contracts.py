@@ -12,13 +12,12 @@ from typing import Any
 import pytest
 
 from tests.runner.manual_clock import ManualClock
-from tests.runner.small_robots import FedCamera, moving, robot_of
+from tests.runner.small_robots import FedCamera, hardware_runner, moving, robot_of
 from tests.support.deployment import load_robot
 from tests.support.paths import ROOT
 from vram_arbiter.runner.protocols import Goal, MobileBase, RobotDescription, SkillEnded
 from vram_arbiter.runner.robots.base import HalBase
 from vram_arbiter.runner.robots.factory import make_hal
-from vram_arbiter.runner.robots.hardware import hardware_runner
 from vram_arbiter.runner.robots.mobile import with_base
 from vram_arbiter.runner.robots.so101 import so101
 from vram_arbiter.runner.robots.so101_kinematics import kinematics_for
