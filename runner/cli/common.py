@@ -13,12 +13,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vram_arbiter.clients.cli.arguments import at_least
+from vram_arbiter.clients.cli.arguments import at_least, positive
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.net.server import check_free
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.clients.sidecar.build import build, manifest_file
-from vram_arbiter.runner.cli.numbers import positive
 from vram_arbiter.runner.goals.catalogue import EXECUTABLE, sidecar_endpoint
 from vram_arbiter.runner.sensors.pictures import encode
 from vram_arbiter.schemas import estop

@@ -12,6 +12,7 @@ import logging
 import os
 from pathlib import Path
 
+from vram_arbiter.clients.cli.arguments import at_least
 from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.common import (
@@ -32,7 +33,6 @@ from vram_arbiter.runner.cli.common import (
 )
 from vram_arbiter.runner.cli.display import add_display_flag, check_display_flag, display_runner
 from vram_arbiter.runner.cli.makers import simulated_operator
-from vram_arbiter.runner.cli.numbers import not_negative
 from vram_arbiter.runner.cli.recording import (
     add_record_flags,
     check_recording,
@@ -70,7 +70,7 @@ def add_parser(commands: Commands) -> argparse.ArgumentParser:
         help="at the end, write when each tick began and how long it took, one JSON line each",
     )  # fmt: skip
     sim.add_argument(
-        "--rate", type=not_negative, default=30.0, help="ticks per second; 0: as fast as possible"
+        "--rate", type=at_least(0.0), default=30.0, help="ticks per second; 0: as fast as possible"
     )
     sim.add_argument(
         "--deadline-policy", choices=("warn", "drop", "raise"), default="warn",
