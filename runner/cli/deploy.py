@@ -27,7 +27,6 @@ from vram_arbiter.runner.cli.common import (
     connect_arbiter,
     default_skills,
     install_signals,
-    serve_for,
     sidecars_given,
     start_sidecars,
 )
@@ -292,13 +291,11 @@ class Deploy:
                 raise
 
     async def _serve(self, server: GoalServer, runner: HardwareRunner) -> ResultPush | None:
-        """Serve until a signal, `shutdown`, the end of the time or of the file's task; return its
-        result.
-        """
+        """Serve until a signal, `shutdown` or the end of the file's task; return its result."""
         task = self._file.robot.task
         own = asyncio.create_task(self._own_task(server, runner)) if task is not None else None
         try:
-            await serve_for(server, self._args.max_seconds)
+            await server.serve()
         finally:
             if own is not None and not own.done():
                 own.cancel()
