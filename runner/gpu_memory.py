@@ -8,7 +8,7 @@ from opentelemetry import metrics
 from opentelemetry.metrics import CallbackOptions, Observation
 
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.runtime.nvml import devices
+from vram_arbiter.schemas.runtime.nvml import bytes_by_pid, devices
 from vram_arbiter.schemas.runtime.telemetry import names as telemetry
 from vram_arbiter.schemas.runtime.telemetry.names import INSTRUMENTS
 
@@ -44,25 +44,9 @@ def _gpu_memory(_: CallbackOptions) -> Iterable[Observation]:
     found = []
     try:
         for handle, _ in devices(pynvml):
-            if (held := _held(handle)) is not None:
+            if (held := bytes_by_pid(pynvml, handle)) is not None:
                 labels = {telemetry.ATTR_GPU: pynvml.nvmlDeviceGetUUID(handle)}
-                found.append(Observation(held, labels))
+                found.append(Observation(held.get(os.getpid(), 0), labels))
     except (pynvml.NVMLError, ConfigError):  # the driver restarts, or the GPU fell off the bus
         pass
     return found
-
-
-def _held(handle: object) -> int | None:
-    """Return the bytes of this process on a GPU, computing and rendering; None: not told."""
-    import pynvml
-
-    pid = os.getpid()
-    listed = [
-        *pynvml.nvmlDeviceGetComputeRunningProcesses(handle),
-        *pynvml.nvmlDeviceGetGraphicsRunningProcesses(handle),
-    ]
-    # a process that computes and renders is in both lists, with the same bytes
-    own = [one.usedGpuMemory for one in listed if one.pid == pid]
-    if any(used is None for used in own):
-        return None
-    return max(own, default=0)

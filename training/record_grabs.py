@@ -13,7 +13,6 @@ from training.datasets import write_tries
 from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE, SceneConfig
 from vram_arbiter.runner.sim.env import SimEnv
 from vram_arbiter.runner.sim.expert import GrabExpert, Phase
-from vram_arbiter.runner.sim.kinematics import ArmKinematics
 from vram_arbiter.runner.sim.tasks import stand_before
 from vram_arbiter.schemas.plain import JsonObject
 
@@ -103,9 +102,7 @@ class Demonstration:
         return all(0.24 < x < 0.41 and abs(y) < 0.09 and z > 0.2 for x, y, z in self.point)
 
 
-def demonstrate(
-    env: SimEnv, kinematics: ArmKinematics, seed: int, driver: Driver | None
-) -> tuple[Demonstration, bool]:
+def demonstrate(env: SimEnv, seed: int, driver: Driver | None) -> tuple[Demonstration, bool]:
     """Return one perturbed demonstration and whether it ended with the object held.
 
     Bursts of noise push the arm off its way (as in DART); what is recorded is always what the
@@ -114,7 +111,7 @@ def demonstrate(
     """
     rng = random.Random(f"demonstration-{seed}")
     name = begin_grab(env, rng, seed)
-    expert, demo = GrabExpert(env, kinematics, name), Demonstration()
+    expert, demo = GrabExpert(env, name), Demonstration()
     push, burst = [0.0] * len(ARM_JOINTS), 0
     planned: list[list[float]] = []
     expert_from = rng.randint(0, 110) if driver is not None else 0
@@ -154,9 +151,8 @@ def record(out: Path, count: int, seed: int, policy: Path | None = None) -> Json
     failed = number = 0
     driver = Driver(policy) if policy is not None else None
     with SimEnv() as env:
-        kinematics = ArmKinematics(env.config)
         while len(kept) < count:
-            demo, held = demonstrate(env, kinematics, seed * 1_000_000 + 500_000 + number, driver)
+            demo, held = demonstrate(env, seed * 1_000_000 + 500_000 + number, driver)
             number += 1
             # an object pushed out of reach teaches nothing; a try that only ran out of time does
             if held or (driver is not None and demo.in_reach()):

@@ -16,7 +16,6 @@ from training.datasets import write_tries
 from training.record_grabs import begin_grab
 from vram_arbiter.runner.sim.env import GroundTruth, SimEnv
 from vram_arbiter.runner.sim.expert import CLOSED_RAD, GrabExpert
-from vram_arbiter.runner.sim.kinematics import ArmKinematics
 from vram_arbiter.schemas.plain import JsonObject
 
 CAMERA: Final = "wrist"
@@ -62,14 +61,14 @@ class Grab:
         self.labels.append({"progress": progress, "held": truth.held})
 
 
-def grab(env: SimEnv, kinematics: ArmKinematics, seed: int) -> Grab:
+def grab(env: SimEnv, seed: int) -> Grab:
     """Record one try, from the folded pose to the carried one, or to an empty gripper."""
     rng = random.Random(f"progress-{seed}")
     name = begin_grab(env, rng, seed)
     missed = rng.random() < MISSES
     angle, aside = rng.uniform(-math.pi, math.pi), rng.uniform(0.035, 0.055) if missed else 0.0
     offset = (aside * math.cos(angle), aside * math.sin(angle))
-    expert = GrabExpert(env, kinematics, name, offset_m=offset, retry=not missed)
+    expert = GrabExpert(env, name, offset_m=offset, retry=not missed)
     taken = Grab()
     after = rng.randint(2, 10)
     for step in range(MAX_STEPS):
@@ -92,10 +91,7 @@ def record(out: Path, count: int, seed: int) -> JsonObject:
     import numpy as np
 
     with SimEnv() as env:
-        kinematics = ArmKinematics(env.config)
-        tries = [
-            grab(env, kinematics, seed * 1_000_000 + 700_000 + number) for number in range(count)
-        ]
+        tries = [grab(env, seed * 1_000_000 + 700_000 + number) for number in range(count)]
     images = np.stack([image for one in tries for image in one.images])
     labels = [label for one in tries for label in one.labels]
     lengths = [len(one.images) for one in tries]

@@ -14,7 +14,6 @@ from training.datasets import LABELS
 from vram_arbiter.runner.sim.config import REST_POSE
 from vram_arbiter.runner.sim.env import SimEnv
 from vram_arbiter.runner.sim.expert import CLOSED_RAD, GrabExpert
-from vram_arbiter.runner.sim.kinematics import ArmKinematics
 from vram_arbiter.runner.sim.tasks import stand_before
 from vram_arbiter.schemas.plain import JsonObject
 
@@ -44,7 +43,7 @@ def shoot(env: SimEnv, camera: str, stage: str) -> Shot:
     }  # fmt: skip
 
 
-def shots(env: SimEnv, kinematics: ArmKinematics, seed: int) -> Iterator[Shot]:
+def shots(env: SimEnv, seed: int) -> Iterator[Shot]:
     """Yield all frames of one layout: start, way, standoff, grabbing, after.
 
     A third of the grabs is made to miss, so that a closed gripper, or one above an object, does not
@@ -65,7 +64,7 @@ def shots(env: SimEnv, kinematics: ArmKinematics, seed: int) -> Iterator[Shot]:
     angle, miss = rng.uniform(-math.pi, math.pi), rng.random() < MISSES
     reach = rng.uniform(0.040, 0.055) if miss else 0.0
     aside = (reach * math.cos(angle), reach * math.sin(angle))
-    expert = GrabExpert(env, kinematics, name, offset_m=aside, retry=not miss)
+    expert = GrabExpert(env, name, offset_m=aside, retry=not miss)
     during = rng.randint(5, 35)
     for step in range(90):
         env.step(expert.act())
@@ -98,8 +97,7 @@ def record(out: Path, count: int, seed: int) -> JsonObject:
     Raises OSError when it cannot.
     """
     with SimEnv() as env:
-        kinematics = ArmKinematics(env.config)
-        return write(out, count, seed, lambda layout: shots(env, kinematics, layout))
+        return write(out, count, seed, lambda layout: shots(env, layout))
 
 
 def write(out: Path, count: int, seed: int, of: Callable[[int], Iterable[Shot]]) -> JsonObject:

@@ -13,7 +13,7 @@ from vram_arbiter.clients import cuda
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.errors import ConfigError, NoGpu, ProbeFailed
 from vram_arbiter.schemas.runtime.fakegpu_folder import locked, settled
-from vram_arbiter.schemas.runtime.nvml import devices
+from vram_arbiter.schemas.runtime.nvml import bytes_by_pid, devices
 
 _HINT = "install the NVIDIA driver, or use --device fake:FOLDER for a simulated GPU"
 
@@ -92,7 +92,7 @@ def nvml_gpu(index: int, nvml: Any) -> Gpu:
 
     def read() -> Reading:
         try:
-            return Reading(nvml.nvmlDeviceGetMemoryInfo(handle).used, _listed(nvml, handle))
+            return Reading(nvml.nvmlDeviceGetMemoryInfo(handle).used, bytes_by_pid(nvml, handle))
         except nvml.NVMLError as error:
             problem = f"memory of GPU {index} cannot be read: {error}"
             raise ProbeFailed(problem, hint="see nvidia-smi and dmesg") from error
@@ -107,18 +107,3 @@ def nvml_gpu(index: int, nvml: Any) -> Gpu:
         raise NoGpu(f"no NVIDIA driver answers for GPU {index}: {error}", hint=_HINT) from error
     environ = {cuda.VISIBLE: uuid, cuda.ORDER: cuda.PCI}
     return Gpu(uuid, name, driver, total, "cuda", environ, read)
-
-
-def _listed(nvml: Any, handle: Any) -> dict[int, int] | None:
-    processes: dict[int, int] = {}
-    for kind in ("Compute", "Graphics"):
-        try:
-            found = getattr(nvml, f"nvmlDeviceGet{kind}RunningProcesses")(handle)
-        except nvml.NVMLError:
-            return None
-        for process in found:
-            if process.usedGpuMemory is None:
-                return None  # WSL2 and some containers list pids alone
-            known = processes.get(process.pid, 0)  # a process in both lists counts once
-            processes[process.pid] = max(known, int(process.usedGpuMemory))
-    return processes

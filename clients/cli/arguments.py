@@ -3,6 +3,7 @@
 import argparse
 import os
 from collections.abc import Callable
+from math import inf
 
 from vram_arbiter.schemas.defaults import NAME_MAX_CHARS, REASON_MAX_CHARS
 from vram_arbiter.schemas.runtime.endpoints import ENDPOINT_VARIABLE
@@ -51,30 +52,33 @@ def size(written: str) -> int:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def at_least(low: float, high: float | None = None) -> Callable[[str], float]:
-    """Return an argparse type: a number from `low` to `high`."""
-
-    def check(written: str) -> float:
-        try:
-            value = float(written)
-        except ValueError:
-            value = float("nan")
-        if not low <= value <= (float("inf") if high is None else high):
-            bound = f"at least {low:g}" if high is None else f"{low:g} to {high:g}"
-            raise argparse.ArgumentTypeError(f"expected a number, {bound}, got {written!r}")
-        return value
-
-    return check
+def at_least(low: float, high: float = inf) -> Callable[[str], float]:
+    """Return an argparse type: a finite number from `low` to `high`."""
+    return _number(float, low, high)
 
 
-def count(low: int, high: int) -> Callable[[str], int]:
+def count(low: int, high: float = inf) -> Callable[[str], int]:
     """Return an argparse type: a whole number from `low` to `high`."""
+    return _number(int, low, high)
 
-    def check(written: str) -> int:
-        if not written.isdecimal() or not low <= int(written) <= high:
-            raise argparse.ArgumentTypeError(
-                f"expected a whole number, {low} to {high}, got {written!r}"
-            )
-        return int(written)
+
+def positive(written: str) -> float:
+    """Argparse type: a finite number above 0."""
+    if not (value := at_least(0.0)(written)):
+        raise argparse.ArgumentTypeError("expected a number above 0")
+    return value
+
+
+def _number[N: (int, float)](kind: type[N], low: float, high: float) -> Callable[[str], N]:
+    def check(written: str) -> N:
+        try:
+            value = kind(written)
+        except ValueError:
+            value = kind(-1)
+        if not low <= value <= high or value == inf:
+            bound = f"at least {low:g}" if high == inf else f"{low:g} to {high:.9g}"
+            whole = "whole " if kind is int else ""
+            raise argparse.ArgumentTypeError(f"expected a {whole}number, {bound}, got {written!r}")
+        return value
 
     return check

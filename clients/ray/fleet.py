@@ -51,8 +51,8 @@ class Fleet:
     starts on them stay for other drivers. Its methods are for one thread.
     """
 
-    def __init__(self, rng: Random | None = None) -> None:
-        self._rng = rng or Random()
+    def __init__(self) -> None:
+        self._rng = Random()
         self._agents: dict[str, Any] = {}
 
     def __enter__(self) -> Self:

@@ -2,9 +2,8 @@
 
 Such a server has a REP socket, one model that is loaded before it listens, and no lease. It knows
 `ping`, `detect`, `query`, `score` and `shutdown` of the op family, or `ping`, `get_action`,
-`reset`, `get_modality_config` and `kill` of the endpoint family. A request that it would answer
-about something else than what was asked (without a token's fence, or one picture of several) is
-refused here.
+`reset` and `kill` of the endpoint family. A request that it would answer about something else than
+what was asked (without a token's fence, or one picture of several) is refused here.
 """
 
 import io
@@ -128,8 +127,6 @@ def _policy_request(op: str, given: Message) -> tuple[str, Message]:
         return op, {"data": {"options": None, **data}}
     if op == "reset":  # a server calls reset(**data), which knows `options`
         return op, {"data": data if data.keys() == {"options"} else {"options": data or None}}
-    if op == "get_modality_config":
-        return op, {}
     if op == "shutdown":
         return "kill", {}
     raise _unknown(op)

@@ -16,42 +16,27 @@ class PolicyClient(SidecarClient):
 
     family = "endpoint"
 
-    async def modality_config(self, *, timeout_s: float | None = None) -> Message:
-        """What a server of the field says about its inputs and outputs: `video`, `state`, `action`
-        and `language`, each with `modality_keys` and `delta_indices`. Raises UnknownOp, for our
-        servers: their manifest says it."""
-        found = await self.call("get_modality_config", timeout_s=timeout_s)
-        if not isinstance(found, dict):
-            raise ModelError(f"get_modality_config answered a {type(found).__name__}, not a map")
-        return {
-            name: config.get("as_json", config) if isinstance(config, dict) else config
-            for name, config in found.items()
-        }
-
     async def reset(
         self,
         data: JsonMap | None = None,
         *,
         token: Sequence[int] | None = None,
-        timeout_s: float | None = None,
     ) -> Message:
         """Forget the episode so far; the answer may say what the next one takes (`ResetResult`).
         Raises Evicted, NotResident, SidecarUnavailable."""
         fields = {"data": npy.pack(dict(data or {}))}
-        result = await self.call("reset", fields, token=token, timeout_s=timeout_s)
+        result = await self.call("reset", fields, token=token)
         return result if isinstance(result, dict) else {}
 
     async def get_action(
         self,
         observation: JsonMap,
         *,
-        options: JsonMap | None = None,
         rtc: RealTimeChunking | None = None,
         whole_chunk: bool = False,
         afresh: bool = False,
         fresh_s: float | None = None,
         token: Sequence[int] | None = None,
-        timeout_s: float | None = None,
     ) -> Message:
         """The next actions by name, e.g. `{"action": array of shape (steps, joints)}`: those that
         are played before it is asked again, or the `whole_chunk`.
@@ -61,18 +46,13 @@ class PolicyClient(SidecarClient):
         Raises Evicted when the sidecar holds another lease than `token`'s, FrameStale after
         `fresh_s`, ModelError, OutOfMemory, SidecarUnavailable.
         """
-        data = {
-            "observation": npy.pack(dict(observation)),
-            "options": npy.pack(dict(options)) if options else None,
-        }
+        data = {"observation": npy.pack(dict(observation))}
         fields: Message = {"data": data} | ({"rtc": rtc.model_dump()} if rtc is not None else {})
         if whole_chunk:
             fields["whole_chunk"] = True
         if afresh:
             fields["afresh"] = True
-        result = npy.unpack(
-            await self.call("get_action", fields, token=token, timeout_s=timeout_s, fresh_s=fresh_s)
-        )
+        result = npy.unpack(await self.call("get_action", fields, token=token, fresh_s=fresh_s))
         if isinstance(result, list) and result:  # the field's servers answer [actions, info]
             result = result[0]
         if not isinstance(result, dict):

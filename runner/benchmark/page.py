@@ -26,26 +26,26 @@ def page(about: JsonMap, cells: Sequence[Cell]) -> str:
     )
 
 
-def rate_of(row: JsonMap) -> str:
-    """Return a cell's success rate in words."""
-    rate = row["success_rate"]
-    return "no verdict" if rate is None else f"{row['successes']}/{row['judged']} = {rate:.0%}"
-
-
-def interval_of(row: JsonMap) -> str:
-    interval = row["interval_95"]
-    return "" if interval is None else f"{interval[0]:.0%} to {interval[1]:.0%}"
+def words(cell: Cell) -> tuple[str, ...]:
+    """Return a cell in words: world, contestant, success, its interval, steps, errors."""
+    row = cell.summary()
+    rate, interval, steps = row["success_rate"], row["interval_95"], row["mean_steps"]
+    return (
+        _world(cell),
+        cell.contestant,
+        "no verdict" if rate is None else f"{row['successes']}/{row['judged']} = {rate:.0%}",
+        "" if interval is None else f"{interval[0]:.0%} to {interval[1]:.0%}",
+        "" if steps is None else f"{steps:.1f}",
+        f"{row['errors']}" + ("" if cell.complete else f"; not complete: {cell.why}"),
+    )
 
 
 def _cell(cell: Cell) -> str:
-    row = cell.summary()
-    steps = "" if row["mean_steps"] is None else f"{row['mean_steps']:.1f}"
-    errors = f"{row['errors']}" + ("" if cell.complete else f"; not complete: {cell.why}")
-    success = f"{rate_of(row)}, {interval_of(row)}{_bar(row)}"
+    world, contestant, rate, interval, steps, errors = map(escape, words(cell))
     return (
-        f"<tr><td>{escape(_world(cell))}</td><td>{escape(cell.contestant)}<br><small>"
-        f"{escape(cell.revision)}</small></td><td>{success}</td>"
-        f'<td class="number">{steps}</td><td>{escape(errors)}</td></tr>'
+        f"<tr><td>{world}</td><td>{contestant}<br><small>{escape(cell.revision)}</small></td>"
+        f"<td>{rate}, {interval}{_bar(cell.summary())}</td>"
+        f'<td class="number">{steps}</td><td>{errors}</td></tr>'
     )
 
 

@@ -7,11 +7,11 @@ import dataclasses
 import json
 from collections.abc import Sequence
 
+from vram_arbiter.clients.cli import text
 from vram_arbiter.clients.cli.files import replace
 from vram_arbiter.runner.benchmark.outcomes import Cell
-from vram_arbiter.runner.benchmark.page import interval_of, page, rate_of
+from vram_arbiter.runner.benchmark.page import page, words
 from vram_arbiter.schemas.errors import ConfigError
-from vram_arbiter.schemas.plain import JsonMap
 
 REPORT = "benchmark.json"
 PAGE = "report.html"
@@ -42,21 +42,4 @@ def write_report(args: argparse.Namespace, cells: Sequence[Cell], *, complete: b
 
 def table(cells: Sequence[Cell]) -> str:
     """Format the cells as a table."""
-    lines = [COLUMNS, *(_row(cell.summary()) for cell in cells)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(COLUMNS))]
-    return "\n".join(
-        "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
-    )
-
-
-def _row(row: JsonMap) -> tuple[str, ...]:
-    task = f" ({row['task']})" if row["task"] else ""
-    return (
-        row["world"] + task,
-        row["contestant"],
-        rate_of(row),
-        interval_of(row),
-        "" if row["mean_steps"] is None else f"{row['mean_steps']:.1f}",
-        f"{row['errors']}" + ("" if row["complete"] else f"; not complete: {row['why']}"),
-    )
+    return "\n".join(text.table(COLUMNS, [words(cell) for cell in cells]))

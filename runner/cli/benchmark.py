@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vram_arbiter.clients.cli.arguments import count, positive
 from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.benchmark import folder
 from vram_arbiter.runner.benchmark.entries import SO101, VIDEOS, Entry, entries_of
@@ -22,7 +23,6 @@ from vram_arbiter.runner.benchmark.progress import ProgressLine
 from vram_arbiter.runner.benchmark.report import MAX_STEPS, PAGE, REPORT, table, write_report
 from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.common import add_skill_flags, install_signals
-from vram_arbiter.runner.cli.numbers import not_negative_int, positive, positive_int
 from vram_arbiter.runner.cli.recording import add_record_flags
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.extras import need
@@ -63,15 +63,15 @@ def add_parser(commands: Commands) -> argparse.ArgumentParser:
         help="random, expert (grabs), scripted:FILE; repeatable",
     )  # fmt: skip
     bench.add_argument(
-        "--episodes", type=positive_int, default=10, help="episodes per cell; default 10"
+        "--episodes", type=count(1), default=10, help="episodes per cell; default 10"
     )
-    bench.add_argument("--seed", type=not_negative_int, default=0, help="seed of the first episode")
+    bench.add_argument("--seed", type=count(0), default=0, help="seed of the first episode")
     bench.add_argument(
-        "--max-steps", type=positive_int, default=MAX_STEPS, help="limit of an episode; default 600"
+        "--max-steps", type=count(1), default=MAX_STEPS, help="limit of an episode; default 600"
     )
     time = bench.add_mutually_exclusive_group()
     time.add_argument(
-        "--latency-steps", type=not_negative_int, metavar="N",
+        "--latency-steps", type=count(0), metavar="N",
         help="a policy's answer takes N control steps; default: as many as it had actions left to"
         " play when it was asked",
     )  # fmt: skip
@@ -88,7 +88,7 @@ def add_parser(commands: Commands) -> argparse.ArgumentParser:
         help="folder of results, report and videos; the same command goes on with what is missing",
     )  # fmt: skip
     bench.add_argument(
-        "--workers", type=positive_int, default=1, metavar="N",
+        "--workers", type=count(1), default=1, metavar="N",
         help="processes that play at the same time, with --ray on each box; default 1",
     )  # fmt: skip
     bench.add_argument(

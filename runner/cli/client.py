@@ -7,8 +7,8 @@ import json
 import sys
 from collections.abc import Mapping
 
+from vram_arbiter.clients.cli.arguments import positive
 from vram_arbiter.clients.runner import RunnerClient
-from vram_arbiter.runner.cli.numbers import positive
 from vram_arbiter.schemas.runtime.printable import printable_lines
 
 WAIT_S = 60.0  # a simulator starts within half a minute, on a busy machine later

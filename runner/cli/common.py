@@ -18,7 +18,6 @@ from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.net.server import check_free
 from vram_arbiter.clients.sidecar.base import SidecarClient
 from vram_arbiter.clients.sidecar.build import build, manifest_file
-from vram_arbiter.runner.cli.numbers import positive
 from vram_arbiter.runner.goals.catalogue import EXECUTABLE, sidecar_endpoint
 from vram_arbiter.runner.sensors.pictures import encode
 from vram_arbiter.schemas import estop
@@ -32,7 +31,7 @@ from vram_arbiter.schemas.manifest import (
 )
 
 if TYPE_CHECKING:
-    from vram_arbiter.runner.goals.server import GoalServer
+    pass
 
 log = logging.getLogger("runner")
 
@@ -92,7 +91,6 @@ def add_serving_flags(parser: argparse.ArgumentParser) -> None:
         help="run the control loop before ordinary programs (SCHED_FIFO, or a lower nice value)"
         " if the machine allows it",
     )  # fmt: skip
-    parser.add_argument("--max-seconds", type=positive, help="stop after this many seconds")
 
 
 def sidecars_given(flags: list[str]) -> dict[str, str]:
@@ -190,15 +188,6 @@ def default_skills() -> Path:
 def announce(endpoint: str) -> None:
     """Say that clients may connect, on stderr: stdout is the run's result."""
     print(f"serving goals on {endpoint}", file=sys.stderr, flush=True)
-
-
-async def serve_for(server: GoalServer, seconds: float | None) -> None:
-    """Serve goals until the server ends, for `seconds` at most."""
-    try:
-        async with asyncio.timeout(seconds):
-            await server.serve()
-    except TimeoutError:
-        log.info("ending after %.0f s, as asked", seconds)
 
 
 def install_signals(stopping: asyncio.Event) -> None:

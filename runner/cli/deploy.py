@@ -27,7 +27,6 @@ from vram_arbiter.runner.cli.common import (
     connect_arbiter,
     default_skills,
     install_signals,
-    serve_for,
     sidecars_given,
     start_sidecars,
 )
@@ -43,7 +42,7 @@ from vram_arbiter.runner.cli.deployment import (
     unused,
 )
 from vram_arbiter.runner.cli.display import add_display_flag, check_display_flag, display_runner
-from vram_arbiter.runner.cli.makers import MakeMakers, Models, policy_makers
+from vram_arbiter.runner.cli.makers import Models, policy_makers
 from vram_arbiter.runner.cli.recording import (
     check_recording,
     conclude_recording,
@@ -110,18 +109,15 @@ async def run(args: argparse.Namespace) -> int:
     file or flag, or a task that the emergency stop ended).
     """
     file = read_deployment(shipped(args.config, "robots", configs_folder(os.environ)))
-    return await Deploy(args, file, policy_makers(file)).run()
+    return await Deploy(args, file).run()
 
 
 class Deploy:
-    """One run of the command. `make_makers` decides which kinds of skills there are."""
+    """One run of the command."""
 
-    def __init__(
-        self, args: argparse.Namespace, file: DeploymentFile, make_makers: MakeMakers
-    ) -> None:
+    def __init__(self, args: argparse.Namespace, file: DeploymentFile) -> None:
         self._args = args
         self._file = file
-        self._make_makers = make_makers
         self._clock = SystemClock()
         self._endpoint: str = args.endpoint or program_endpoint("runner", os.environ, os.getuid())
         self._stopping = asyncio.Event()
@@ -217,7 +213,7 @@ class Deploy:
 
     # -- steps
     def _offered(self, parts: Parts, manifests: list[RSkillManifest], models: Models) -> Catalogue:
-        makers = self._make_makers(parts, models)
+        makers = policy_makers(self._file.robot, parts, models)
         return offered(self._file, parts, manifests, makers, self._args.allow_noncommercial)
 
     def _taken(self) -> list[tuple[str, str]]:
@@ -295,13 +291,11 @@ class Deploy:
                 raise
 
     async def _serve(self, server: GoalServer, runner: HardwareRunner) -> ResultPush | None:
-        """Serve until a signal, `shutdown`, the end of the time or of the file's task; return its
-        result.
-        """
+        """Serve until a signal, `shutdown` or the end of the file's task; return its result."""
         task = self._file.robot.task
         own = asyncio.create_task(self._own_task(server, runner)) if task is not None else None
         try:
-            await serve_for(server, self._args.max_seconds)
+            await server.serve()
         finally:
             if own is not None and not own.done():
                 own.cancel()

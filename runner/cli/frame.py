@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 from typing import Literal
 
+from vram_arbiter.clients.cli.arguments import positive
 from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.client import add_client_flags, client_of, note
-from vram_arbiter.runner.cli.numbers import positive
 from vram_arbiter.schemas.errors import ConfigError
 
 ENCODINGS: dict[str, Literal["jpeg", "png"]] = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}

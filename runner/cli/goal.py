@@ -9,9 +9,9 @@ import signal
 from collections.abc import AsyncIterator
 from typing import TYPE_CHECKING
 
+from vram_arbiter.clients.cli.arguments import count, positive
 from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.client import add_client_flags, client_of, note, show_json
-from vram_arbiter.runner.cli.numbers import positive, positive_int
 from vram_arbiter.schemas.plain import JsonMap
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def add_parser(commands: Commands) -> argparse.ArgumentParser:
         "--params", type=_object, default={}, metavar="JSON", help="the goal's parameters"
     )
     goal.add_argument("--deadline", type=positive, default=0.0, metavar="SECONDS")
-    goal.add_argument("--max-ticks", type=positive_int)
+    goal.add_argument("--max-ticks", type=count(1))
     goal.add_argument("--id", help="name of the goal; default: a new one")
     add_client_flags(goal)
     return goal

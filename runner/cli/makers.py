@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vram_arbiter.clients.client import AsyncClient
-from vram_arbiter.runner.cli.deployment import DeploymentFile, Parts, read_deployment
+from vram_arbiter.runner.cli.deployment import Parts, read_deployment
 from vram_arbiter.runner.goals.catalogue import Maker
 from vram_arbiter.runner.robots.so101 import lerobot_units_of
 from vram_arbiter.runner.robots.teleoperators import Teleoperator, make_teleoperator
@@ -37,31 +37,24 @@ class Models:
     servers: Mapping[str, AsyncClient] = field(default_factory=dict)
 
 
-MakeMakers = Callable[[Parts, Models], Mapping[Kind, Maker]]
-"""How skills of each kind are made for this robot."""
+def policy_makers(robot: RobotEnvironment, parts: Parts, models: Models) -> dict[Kind, Maker]:
+    """Return the makers of learnt policies, each in its sidecar, and of what stands in for ROS 2
+    actions. Raises ConfigError."""
+    from vram_arbiter.runner.skills.makers import makers_of
 
-
-def policy_makers(file: DeploymentFile) -> MakeMakers:
-    """Learnt policies, each in its sidecar, and what stands in for ROS 2 actions."""
-
-    def make_makers(parts: Parts, models: Models) -> Mapping[Kind, Maker]:
-        from vram_arbiter.runner.skills.makers import makers_of
-
-        joints = parts.hal.description.joint_names
-        services = StandIns(service_servers(file.robot), joints, "ros_services")
-        made = makers_of(
-            parts.hal.description,
-            lambda manifest: parts.gate.for_skill(manifest, ()).limits,
-            parts.hal.sent,
-            models.given,
-            models.arbiter,
-            period_s=1.0 / file.robot.rate_hz,
-            others={**ros_servers(file.robot), **operator_of(parts, 1.0 / file.robot.rate_hz)},
-            servers=models.servers,
-        )
-        return {**made, Kind.ROS_SERVICE: services}
-
-    return make_makers
+    period_s = 1.0 / robot.rate_hz
+    made = makers_of(
+        parts.hal.description,
+        lambda manifest: parts.gate.for_skill(manifest, ()).limits,
+        parts.hal.sent,
+        models.given,
+        models.arbiter,
+        period_s=period_s,
+        others={**ros_servers(robot), **operator_of(parts, period_s)},
+        servers=models.servers,
+    )
+    joints = parts.hal.description.joint_names
+    return {**made, Kind.ROS_SERVICE: StandIns(service_servers(robot), joints, "ros_services")}
 
 
 def ros_servers(robot: RobotEnvironment) -> dict[str, StandIn]:

@@ -12,10 +12,10 @@ import os
 import sys
 from collections.abc import Iterator
 
+from vram_arbiter.clients.cli.arguments import count
 from vram_arbiter.clients.runner import Goal, RunnerClient
 from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.client import add_client_flags, client_of, note, show
-from vram_arbiter.runner.cli.numbers import positive_int
 from vram_arbiter.runner.skills.teleop import NAME
 from vram_arbiter.schemas.errors import BadState, Cancelled, ConfigError, UnknownSkill, VramError
 
@@ -26,7 +26,7 @@ def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner record`."""
     record = commands.add_parser("record", help="record demonstrations by the teleoperator")
     record.add_argument("task", help="what is done, in words: the episodes' task")
-    record.add_argument("--episodes", type=positive_int, default=1, help="to keep; default 1")
+    record.add_argument("--episodes", type=count(1), default=1, help="to keep; default 1")
     add_client_flags(record)
     return record
 

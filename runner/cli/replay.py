@@ -10,8 +10,8 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
+from vram_arbiter.clients.cli.arguments import count
 from vram_arbiter.runner.cli import Commands
-from vram_arbiter.runner.cli.numbers import not_negative_int
 from vram_arbiter.runner.recording.reader import Recorded, read_frame
 from vram_arbiter.schemas.errors import ConfigError
 from vram_arbiter.schemas.runtime.printable import printable_lines
@@ -26,12 +26,12 @@ def add_parser(commands: Commands) -> argparse.ArgumentParser:
     replay.add_argument("--dataset", type=Path, required=True, help="folder of the recording")
     replay.add_argument(
         "--frame",
-        type=not_negative_int,
+        type=count(0),
         required=True,
         help="number of the frame over all episodes, from 0 on",
     )
     replay.add_argument(
-        "--episode", type=not_negative_int, help="count frames from the beginning of this episode"
+        "--episode", type=count(0), help="count frames from the beginning of this episode"
     )
     replay.add_argument("--json", action="store_true", help="all of it, for programs")
     replay.add_argument(

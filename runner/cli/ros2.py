@@ -7,10 +7,10 @@ import asyncio
 import contextlib
 import importlib.util
 
+from vram_arbiter.clients.cli.arguments import positive
 from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.client import add_client_flags, client_of, note
 from vram_arbiter.runner.cli.common import install_signals
-from vram_arbiter.runner.cli.numbers import positive
 from vram_arbiter.runner.ros2.goal_action import INTERFACE, NAME, RunnerGoals
 from vram_arbiter.runner.sensors.ros2_dds import domain_of
 from vram_arbiter.runner.skills.ros_standins import TRAJECTORY

@@ -6,16 +6,16 @@ import argparse
 import asyncio
 from pathlib import Path
 
+from vram_arbiter.clients.cli.arguments import count
 from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.client import note
-from vram_arbiter.runner.cli.numbers import not_negative_int
 
 
 def add_parser(commands: Commands) -> argparse.ArgumentParser:
     """Add the parser of `vram-runner rosbag`."""
     rosbag = commands.add_parser("rosbag", help="export a recorded episode as a rosbag2 (MCAP)")
     rosbag.add_argument("--dataset", type=Path, required=True, help="folder of the recording")
-    rosbag.add_argument("--episode", type=not_negative_int, required=True)
+    rosbag.add_argument("--episode", type=count(0), required=True)
     rosbag.add_argument("--out", type=Path, required=True, help="the bag's folder, which is new")
     return rosbag
 

@@ -12,6 +12,7 @@ import logging
 import os
 from pathlib import Path
 
+from vram_arbiter.clients.cli.arguments import at_least
 from vram_arbiter.clients.output_paths import check_output
 from vram_arbiter.runner.cli import Commands
 from vram_arbiter.runner.cli.common import (
@@ -24,7 +25,6 @@ from vram_arbiter.runner.cli.common import (
     default_skills,
     install_signals,
     lease_rendering,
-    serve_for,
     sidecars_given,
     start_sidecars,
     unlicensed,
@@ -32,7 +32,6 @@ from vram_arbiter.runner.cli.common import (
 )
 from vram_arbiter.runner.cli.display import add_display_flag, check_display_flag, display_runner
 from vram_arbiter.runner.cli.makers import simulated_operator
-from vram_arbiter.runner.cli.numbers import not_negative
 from vram_arbiter.runner.cli.recording import (
     add_record_flags,
     check_recording,
@@ -70,12 +69,8 @@ def add_parser(commands: Commands) -> argparse.ArgumentParser:
         help="at the end, write when each tick began and how long it took, one JSON line each",
     )  # fmt: skip
     sim.add_argument(
-        "--rate", type=not_negative, default=30.0, help="ticks per second; 0: as fast as possible"
+        "--rate", type=at_least(0.0), default=30.0, help="ticks per second; 0: as fast as possible"
     )
-    sim.add_argument(
-        "--deadline-policy", choices=("warn", "drop", "raise"), default="warn",
-        help="what to do with a late action: send it, drop it, or end the run; default warn",
-    )  # fmt: skip
     sim.add_argument(
         "--lockstep", action=argparse.BooleanOptionalAction, default=True,
         help="let the simulated world wait for the policy's chunks, so that a slow machine only"
@@ -86,7 +81,7 @@ def add_parser(commands: Commands) -> argparse.ArgumentParser:
 
 
 async def run(args: argparse.Namespace) -> int:
-    """Build everything, serve until a signal, `shutdown` or `--max-seconds`; end."""
+    """Build everything, serve until a signal or `shutdown`; end."""
     endpoint = args.endpoint or program_endpoint("runner", os.environ, os.getuid())
     check_endpoint(endpoint)
     need("the simulator", "numpy", "cv2", extra="runner")
@@ -94,7 +89,6 @@ async def run(args: argparse.Namespace) -> int:
     from vram_arbiter.runner.control.realtime import leaves_room, make_prompt
     from vram_arbiter.runner.goals.catalogue import Catalogue, read_manifests
     from vram_arbiter.runner.goals.server import GoalServer
-    from vram_arbiter.runner.protocols import DeadlinePolicy
     from vram_arbiter.runner.sim.robot import VIDEO_EVERY, sim_runner
     from vram_arbiter.runner.sim.truth import truth_as_wire
     from vram_arbiter.runner.sim.video import VideoRecorder
@@ -131,7 +125,6 @@ async def run(args: argparse.Namespace) -> int:
             world,
             seed=args.seed,
             rate_hz=args.rate,
-            deadline_policy=DeadlinePolicy(args.deadline_policy),
             clock=clock,
         )
         runner.identity = {"robot": args.robot, "scene": str(args.scene or "built-in")}
@@ -174,7 +167,7 @@ async def run(args: argparse.Namespace) -> int:
             realtime=args.realtime,
         )
         install_signals(stopping)
-        await serve_for(server, args.max_seconds)
+        await server.serve()
     result = runner.result()
     log.info(
         "%d ticks, %d late, p99 %.1f ms",

@@ -243,13 +243,6 @@ class RobotGate:
                 raise SafetyViolation(
                     "measured_speed", f"{name} moves at {speed:.2f} rad/s, the limit is {limit:.2f}"
                 )
-        for place, force in world.contact_forces.items():
-            if math.hypot(*force) > self.limits.contact_force_n:
-                raise SafetyViolation(
-                    "contact_force",
-                    f"{place}: {math.hypot(*force):.1f} N of contact,"
-                    f" the limit is {self.limits.contact_force_n:g}",
-                )
 
     # -- efforts
     def _yield(

@@ -31,7 +31,6 @@ POSITIVE = (
     "max_joint_speed_factor",
     "max_force_n",
     "max_torque_nm",
-    "contact_force_threshold_n",
     "max_cartesian_step_m",
     "max_base_linear_speed_m_s",
     "max_base_angular_speed_rad_s",
@@ -122,7 +121,6 @@ class Limits:
     ee_step_m: float = math.inf
     torque_nm: float = math.inf
     force_n: float = math.inf
-    contact_force_n: float = math.inf
     base_speed_m_s: float = 0.0
     base_turn_rad_s: float = 0.0
     unkept: tuple[str, ...] = field(default=())
@@ -162,7 +160,6 @@ def tighten(
         },
         torque_nm=min(limits.torque_nm, envelope.max_torque_nm),
         force_n=min(limits.force_n, envelope.max_force_n),
-        contact_force_n=min(limits.contact_force_n, envelope.contact_force_threshold_n),
         base_speed_m_s=min(limits.base_speed_m_s, _or_inf(envelope.max_base_linear_speed_m_s)),
         base_turn_rad_s=min(limits.base_turn_rad_s, _or_inf(envelope.max_base_angular_speed_rad_s)),
         unkept=(*limits.unkept, *_unkept(envelope, name, robot, kinematics)),
@@ -259,7 +256,6 @@ def _unkept(
         ("max_force_n", robot.tells_efforts, "this robot does not tell efforts"),
         ("max_force_n", kinematics is not None, "no kinematics of this robot"),
         ("e_stop_topic", False, "no topic is listened to: `vram-runner estop` stops the robot"),
-        ("contact_force_threshold_n", False, "no robot here has contact sensors"),
     )
     reasons: dict[str, str] = {}
     for key, there, why in without:

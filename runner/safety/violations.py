@@ -14,7 +14,6 @@ type Check = Literal[
     "base_speed",
     "joint_range",
     "measured_speed",
-    "contact_force",
     "effort",
     "joint_speed",
     "following_error",

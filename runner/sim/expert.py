@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import enum
 import math
+from dataclasses import replace
 
+from vram_arbiter.runner.robots.so101 import TOOL, so101
+from vram_arbiter.runner.sim.config import ARM_JOINTS
 from vram_arbiter.runner.sim.env import SimEnv
-from vram_arbiter.runner.sim.kinematics import ArmKinematics
+from vram_arbiter.runner.skills.kinematics import ArmModel, Pose3
 
 OPEN_RAD = 0.80
 CLOSED_RAD = -0.10
@@ -43,6 +46,16 @@ class Phase(enum.Enum):
     DONE = enum.auto()
 
 
+def _arm() -> ArmModel:
+    """Return the model of the arm; its wrist does not roll."""
+    robot = so101(simulated=True)
+    joints = [
+        replace(joint, lower_rad=0.0, upper_rad=0.0) if joint.name == "wrist_roll" else joint
+        for joint in robot.joints
+    ]
+    return ArmModel(replace(robot, joints=tuple(joints)))
+
+
 class GrabExpert:
     """Produces one joint target per control step until `done`; closed loop on the true object pose.
 
@@ -53,13 +66,12 @@ class GrabExpert:
     def __init__(
         self,
         env: SimEnv,
-        kinematics: ArmKinematics,
         name: str,
         *,
         offset_m: tuple[float, float] = (0.0, 0.0),
         retry: bool = True,
     ) -> None:
-        self._env, self._kinematics, self._name = env, kinematics, name
+        self._env, self._name, self._arm = env, name, _arm()
         self._offset, self._retry = offset_m, retry
         self.phase = Phase.APPROACH
         self._in_phase = 0
@@ -142,12 +154,19 @@ class GrabExpert:
         return [*arm, CLOSED_RAD]
 
     def _towards(self, goal: tuple[float, float, float], grip: float) -> list[float]:
-        """Return joint angles for a point on the straight way to the grasp point, within the
-        lead.
+        """Return joint angles for a point on the straight way to the grasp point, within the lead,
+        with the fingers down as far as they can.
         """
+        import numpy as np
+        from scipy.spatial.transform import Rotation
+
         here = self._env.gripper_position()
         gap = math.dist(here, goal)
         share = 1.0 if gap <= LEAD_M else LEAD_M / gap
         ahead = [a + share * (b - a) for a, b in zip(here, goal, strict=True)]
-        joints, _ = self._kinematics.solve(ahead, list(self._env.joint_state().values()))
-        return [*joints[:5], grip]
+        joints, mount = self._env.joint_state(), self._env.config.mount_in_base_m
+        matrix = self._arm.pose(TOOL, joints).matrix
+        upright, _ = Rotation.align_vectors([(0.0, 0.0, 1.0)], [matrix[:, 2]])
+        target = Pose3(np.subtract(ahead, mount), upright.as_matrix() @ matrix)
+        reached = self._arm.reach(TOOL, target, joints, turning=False).joints
+        return [*(reached[name] for name in ARM_JOINTS[:5]), grip]

@@ -84,9 +84,8 @@ def policy_of(name: str) -> MakeStep:
 def _expert(env: ArmEnvironment, seed: int) -> Step:
     """Begin the scripted grab of the demonstrations, which reads the ground truth."""
     from vram_arbiter.runner.sim.expert import GrabExpert
-    from vram_arbiter.runner.sim.kinematics import ArmKinematics
 
-    expert = GrabExpert(env.arm, ArmKinematics(env.arm.config), env.arm.target)
+    expert = GrabExpert(env.arm, env.arm.target)
     after = 0
 
     def act(_: WorldState) -> list[float] | None:

@@ -18,7 +18,6 @@ from vram_arbiter.runner.control.clock import Clock, SystemClock
 from vram_arbiter.runner.control.loop import ControlLoop
 from vram_arbiter.runner.control.robot import Applied, Sensed
 from vram_arbiter.runner.protocols import (
-    DeadlinePolicy,
     GoalData,
     SafetyGate,
     SkillEnded,
@@ -265,7 +264,6 @@ def sim_runner(
     *,
     seed: int = 0,
     rate_hz: float = 30.0,
-    deadline_policy: DeadlinePolicy = DeadlinePolicy.WARN,
     clock: Clock | None = None,
     max_steps: int | None = None,
     ends_with_skill: bool = False,
@@ -275,6 +273,4 @@ def sim_runner(
     robot = SimRobot(
         env, seed=seed, clock=clock, max_steps=max_steps, ends_with_skill=ends_with_skill
     )
-    return ControlLoop(
-        robot, rate_hz=rate_hz, deadline_policy=deadline_policy, clock=clock, video=robot.video
-    )
+    return ControlLoop(robot, rate_hz=rate_hz, clock=clock, video=robot.video)

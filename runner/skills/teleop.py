@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping
 
-from vram_arbiter.runner.control.clock import Clock, SystemClock
+from vram_arbiter.runner.control.clock import SystemClock
 from vram_arbiter.runner.protocols import Act, Goal, Hold, StepOutcome
 from vram_arbiter.runner.robots.teleoperators import Teleoperator
 from vram_arbiter.runner.safety.limits import Limits
@@ -65,7 +65,6 @@ class Teleop(SkillBase):
         *,
         period_s: float,
         sent: Callable[[], Mapping[str, float]],
-        clock: Clock | None = None,
     ) -> None:
         super().__init__(manifest)
         self._teleoperator = teleoperator
@@ -75,7 +74,7 @@ class Teleop(SkillBase):
             name: STEP_SHARE * speed * period_s for name, speed in limits.speeds_rad_s.items()
         }
         self._sent = sent
-        self._clock = clock or SystemClock()
+        self._clock = SystemClock()
         self._aligned = False  # the robot was where the leader is
         self._moving = False  # the motors have a target of ours
         self._pace = 1.0

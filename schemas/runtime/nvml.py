@@ -32,6 +32,22 @@ def devices(nvml: Any) -> list[Device]:
     return found
 
 
+def bytes_by_pid(nvml: Any, handle: Any) -> dict[int, int] | None:
+    """Return what each process holds on a GPU, computing and rendering; None: it does not tell."""
+    processes: dict[int, int] = {}
+    for kind in ("Compute", "Graphics"):
+        try:
+            found = getattr(nvml, f"nvmlDeviceGet{kind}RunningProcesses")(handle)
+        except nvml.NVMLError:
+            return None
+        for process in found:
+            if process.usedGpuMemory is None:
+                return None  # WSL2 and some containers list pids alone
+            known = processes.get(process.pid, 0)  # a process in both lists counts once
+            processes[process.pid] = max(known, int(process.usedGpuMemory))
+    return processes
+
+
 def _is_split(nvml: Any, handle: Any) -> bool:
     try:
         return bool(nvml.nvmlDeviceGetMigMode(handle)[0])

@@ -12,7 +12,7 @@ import pytest
 
 from tests.runner.manual_clock import ManualClock
 from tests.support.prepared import warm
-from vram_arbiter.runner.protocols import DeadlinePolicy, Joint, MobileBase, RobotDescription
+from vram_arbiter.runner.protocols import Joint, MobileBase, RobotDescription
 from vram_arbiter.runner.sim.arm_env import ArmEnvironment
 from vram_arbiter.runner.sim.robot import SimRunner, sim_runner
 from vram_arbiter.schemas.world import CameraModel
@@ -145,7 +145,6 @@ def make_runner(env: KinematicEnv) -> Callable[..., SimRunner]:
 
     def make(**options: Any) -> SimRunner:
         cameras = options.pop("cameras", ())
-        options.setdefault("deadline_policy", DeadlinePolicy.WARN)
         return sim_runner(world_of(env, options.pop("judge", None), cameras), **options)
 
     return make

@@ -8,12 +8,12 @@ import logging
 import os
 import sys
 from collections.abc import Mapping
+from unittest import mock
 
 from tests.runner.small_robots import Nod
 from vram_arbiter.runner.__main__ import parse
-from vram_arbiter.runner.cli.deploy import Deploy
-from vram_arbiter.runner.cli.deployment import Parts, read_deployment
-from vram_arbiter.runner.cli.makers import Models
+from vram_arbiter.runner.cli import deploy
+from vram_arbiter.runner.cli.deployment import read_deployment
 from vram_arbiter.runner.goals.catalogue import Maker
 from vram_arbiter.schemas.errors import ConfigError, EstopRequested, VramError
 from vram_arbiter.schemas.manifest import Kind
@@ -22,7 +22,7 @@ STEPS = os.environ.get("NOD_STEPS")
 CAMERAS = tuple(filter(None, os.environ.get("NOD_CAMERAS", "").split(",")))
 
 
-def makers(parts: Parts, models: Models) -> Mapping[Kind, Maker]:
+def makers(*_: object) -> Mapping[Kind, Maker]:
     steps = int(STEPS) if STEPS else None
     return {
         Kind.ROS_ACTION: lambda manifest: Nod(
@@ -35,7 +35,8 @@ def main() -> int:
     logging.basicConfig(level="INFO", stream=sys.stderr)
     args = parse(None)
     try:
-        return asyncio.run(Deploy(args, read_deployment(args.config), makers).run())
+        with mock.patch.object(deploy, "policy_makers", makers):
+            return asyncio.run(deploy.Deploy(args, read_deployment(args.config)).run())
     except VramError as error:
         print(error, file=sys.stderr)
         return 2 if isinstance(error, ConfigError | EstopRequested) else 1

@@ -126,9 +126,6 @@ class FieldServer:
                 return self._act(**(data or {}))
             case "reset":
                 return self._reset(**(data or {}))
-            case "get_modality_config":
-                video = {"delta_indices": [0], "modality_keys": ["image"]}
-                return {"video": {"__ModalityConfig_class__": True, "as_json": video}}
             case "kill":
                 return None
         raise ValueError(f"Unknown endpoint: {endpoint}")

@@ -17,7 +17,6 @@ from vram_arbiter.runner.robots.so101 import lerobot_units_of, so101
 from vram_arbiter.runner.sim.config import ARM_JOINTS
 from vram_arbiter.runner.sim.env import SimEnv
 from vram_arbiter.runner.sim.expert import GrabExpert
-from vram_arbiter.runner.sim.kinematics import ArmKinematics
 from vram_arbiter.schemas.goals import ResultPush
 
 STEP_S = 0.3  # from pose to pose of the script, which takes 1/30 s: people are slower
@@ -42,7 +41,7 @@ def poses(seed: int, base_pose: tuple[float, float, float]) -> Iterator[dict[str
     with SimEnv() as env:
         env.reset(seed)
         env.place(base_pose)
-        expert = GrabExpert(env, ArmKinematics(env.config), env.target)
+        expert = GrabExpert(env, env.target)
         while not expert.done:
             angles = expert.act()
             yield units.named(dict(zip(ARM_JOINTS, angles, strict=True)))

@@ -96,8 +96,6 @@ async def test_every_operation_of_the_endpoint_family(server: FieldServer) -> No
         assert actions["action.z"] == 0.0
         assert server.heard[-1]["data"]["options"] is None
         assert server.heard[-1]["data"]["observation"]["task"] == ["grab"]
-        config = await policy.modality_config()
-        assert config == {"video": {"delta_indices": [0], "modality_keys": ["image"]}}
         with pytest.raises(ModelError, match="as asked"):
             await policy.get_action({"state.x": state, "task": "fail"})
         server.action = {"bad": {b"nd": True, b"type": "|O", b"kind": b"O", b"data": b"pickle"}}

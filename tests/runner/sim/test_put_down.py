@@ -15,7 +15,6 @@ if find_spec("mujoco") is None:
 from vram_arbiter.runner.protocols import Act, Done, Goal
 from vram_arbiter.runner.sim.config import ARM_JOINTS, REST_POSE
 from vram_arbiter.runner.sim.expert import GrabExpert
-from vram_arbiter.runner.sim.kinematics import ArmKinematics
 from vram_arbiter.runner.sim.tasks import stand_before
 from vram_arbiter.runner.sim.worlds import so101_world
 from vram_arbiter.runner.skills.trajectory import FollowJointTrajectory
@@ -35,7 +34,7 @@ def test_what_was_grasped_stands_again_where_the_arm_takes_things_from(shape: st
         environment.reset(7)
         env.reset(7, names=(f"red {shape}", "blue cube"))
         stand_before(env, env.target, random.Random(shape), error_m=0.005)
-        expert = GrabExpert(env, ArmKinematics(env.config), env.target)
+        expert = GrabExpert(env, env.target)
         while not expert.done:
             environment.step(environment.action_of(environment.toward(expert.act())))
         assert env.held_object() == env.target

@@ -566,7 +566,8 @@ def test_a_scene_that_takes_long_to_build_misses_no_deadline(
 
     env.reset = slowly
     options = {"rate_hz": 10, "max_steps": 3, "clock": clock}
-    runner = make_runner(deadline_policy=DeadlinePolicy.RAISE, **options)
+    runner = make_runner(**options)
+    runner.deadline_policy = DeadlinePolicy.RAISE
     runner.activate()
     result = runner.run(max_ticks=8)
     assert (env.resets, result.budget_violations) == ([0, 1], 0)

@@ -56,14 +56,13 @@ def test_a_grab_makes_progress_and_only_for_the_thing_it_grabs(
     from tests.support.tabletop import photo, run_expert
     from vram_arbiter.runner.sim.env import SimEnv
     from vram_arbiter.runner.sim.expert import GrabExpert
-    from vram_arbiter.runner.sim.kinematics import ArmKinematics
     from vram_arbiter.runner.sim.tasks import stand_before
 
     with SimEnv() as env:
         env.reset(4711, names=("red cube", "blue ball", "green cylinder"))
         stand_before(env, "red cube", random.Random(0), error_m=0.0)
         before = photo(env, "wrist")
-        assert run_expert(env, GrabExpert(env, ArmKinematics(env.config), "red cube"))
+        assert run_expert(env, GrabExpert(env, "red cube"))
         after = photo(env, "wrist")
     right = score(shipped_adapter, before, after)
     assert right["success"][0] < 0.5 < right["success"][1]

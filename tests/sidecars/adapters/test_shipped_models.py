@@ -29,7 +29,6 @@ from tests.support.tabletop import NAMES, photo, run_expert
 from training import record_counter
 from vram_arbiter.runner.sim.env import SimEnv
 from vram_arbiter.runner.sim.expert import GrabExpert
-from vram_arbiter.runner.sim.kinematics import ArmKinematics
 from vram_arbiter.runner.sim.tasks import stand_before
 
 pytestmark = pytest.mark.heavy
@@ -127,13 +126,12 @@ def test_the_limit_of_wrong_answers_is_the_binomials(asked: int, rate: float, wr
 def test_the_scene_vlm_answers_as_its_card_says(scenes: range):
     exam = Exam("so101-scene-vlm")
     with SimEnv() as env:
-        kinematics = ArmKinematics(env.config)
         for seed in scenes:
             env.reset(seed)
             target, other = env.layout.objects[0].name, env.layout.objects[1].name
             stand_before(env, target, random.Random(seed))
             exam.ask(env, target)
-            assert run_expert(env, GrabExpert(env, kinematics, target)), "choose another seed"
+            assert run_expert(env, GrabExpert(env, target)), "choose another seed"
             exam.ask(env, target)
             exam.ask(env, other)  # its second object has the target's color
     exam.judge()
