@@ -8,7 +8,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Collection
+from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -20,10 +20,10 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.sidecar.build import CLIENTS
 from vram_arbiter.schemas.defaults import RESERVE_BYTES, VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
-from vram_arbiter.schemas.errors import ProbeFailed, SidecarUnavailable
+from vram_arbiter.schemas.errors import SidecarUnavailable
 from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.runtime.threads import in_daemon_thread
+from vram_arbiter.schemas.runtime.threads import answered_within
 from vram_arbiter.schemas.sizes import format_bytes
 
 READING_S: Final = 5.0
@@ -47,16 +47,6 @@ def need(*packages: str) -> None:
     """Raises Skipped where one of these packages of the sidecars is not installed."""
     if not all(map(find_spec, packages)):
         raise Skipped("install 'vram-arbiter[sidecars]'")
-
-
-async def answered_within[T](limit_s: float, work: Callable[[], T]) -> T:
-    """Do work of the driver, which may hang. Raises ProbeFailed after `limit_s`."""
-    try:
-        async with asyncio.timeout(limit_s):
-            return await in_daemon_thread(work, "driver")
-    except TimeoutError:
-        late = f"the driver gave no answer within {limit_s:g} s"
-        raise ProbeFailed(late, hint="see nvidia-smi and dmesg") from None
 
 
 async def ask(holder: Program, word: str, *sizes: int) -> JsonMap:

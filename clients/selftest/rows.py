@@ -23,7 +23,6 @@ from vram_arbiter.clients.selftest.bed import (
     MODEL_S,
     Bed,
     Missed,
-    answered_within,
     ask,
     need,
 )
@@ -31,6 +30,7 @@ from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import MIB, VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
 from vram_arbiter.schemas.errors import VramError, WaitTimeout
 from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.runtime.threads import answered_within
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 type Found = tuple[float, str]
