@@ -30,7 +30,7 @@ from vram_arbiter.arbiter.host.heartbeat import beat
 from vram_arbiter.arbiter.host.history import CLEAN_END, History
 from vram_arbiter.arbiter.host.journal import Journal
 from vram_arbiter.arbiter.host.observer import Observer
-from vram_arbiter.arbiter.host.prober import Prober, within
+from vram_arbiter.arbiter.host.prober import Prober
 from vram_arbiter.arbiter.host.process import leave_no_zombies, memory_bytes, raise_limits
 from vram_arbiter.arbiter.host.process_watch import ProcessWatch
 from vram_arbiter.arbiter.host.records import record_of
@@ -53,6 +53,7 @@ from vram_arbiter.schemas.runtime.folders import LockFile
 from vram_arbiter.schemas.runtime.procfs import boot_id, cgroup_root, start_ticks
 from vram_arbiter.schemas.runtime.router import Router
 from vram_arbiter.schemas.runtime.systemd import Notifier
+from vram_arbiter.schemas.runtime.threads import answered_within
 from vram_arbiter.schemas.units import format_bytes
 from vram_arbiter.schemas.wire.views import DaemonView
 
@@ -285,9 +286,9 @@ class Daemon:
 
     async def _open_gpus(self, places: Places) -> tuple[GpuProbe, tuple[GpuInfo, ...]]:
         opening = partial(open_probe, self._config.gpu, places.runtime)
-        probe, source = await within(PROBE_START_S, opening, "the GPU driver")
+        probe, source = await answered_within(PROBE_START_S, opening, "the GPU driver")
         try:
-            gpus = await within(PROBE_START_S, probe.gpus, "the GPU driver")
+            gpus = await answered_within(PROBE_START_S, probe.gpus, "the GPU driver")
             return probe, budget(gpus, self._config, source)
         except BaseException:
             probe.close()

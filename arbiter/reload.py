@@ -17,13 +17,13 @@ from typing import Any
 
 from vram_arbiter.arbiter.core.events import SettingsChanged
 from vram_arbiter.arbiter.host.history import History
-from vram_arbiter.arbiter.host.prober import within
 from vram_arbiter.arbiter.inbox import Inbox
 from vram_arbiter.arbiter.settings import core_changes
 from vram_arbiter.schemas.config.arbiter import LIVE_KEYS, ArbiterConfig
 from vram_arbiter.schemas.errors import ConfigError, VramError
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime.systemd import Notifier
+from vram_arbiter.schemas.runtime.threads import answered_within
 
 READ_S = 10.0
 """Time limit of reading the file, which may be on a disk that hangs."""
@@ -76,7 +76,7 @@ class Reload:
             notifier.reloading()
             try:
                 read = partial(_read, self._source, self._file)
-                file, config = await within(READ_S, read, "the configuration file")
+                file, config = await answered_within(READ_S, read, "the configuration file")
             except VramError as error:
                 self._refuse(error)
             else:

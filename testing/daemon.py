@@ -97,8 +97,8 @@ class ArbiterProcess:
         return self
 
     def wait_for(self, word: str, timeout_s: float = WITHIN_S) -> str:
-        """Wait for a notification that holds `word`. Raises RuntimeError if the daemon ends, and
-        AssertionError if it stays silent, with its log."""
+        """Wait for a notification that holds `word`. Raises RuntimeError with the log if the daemon
+        ends, and AssertionError if it stays silent."""
 
         def told() -> str:
             assert self.process is not None
@@ -108,7 +108,7 @@ class ArbiterProcess:
                     return self.messages[-1]
             if ended is not None:
                 raise RuntimeError(f"the arbiter ended with {ended}:\n{self.log}")
-            raise AssertionError(f"no {word} from the arbiter:\n{self.log}")
+            raise AssertionError(f"no {word} from the arbiter")
 
         return eventually(told, timeout_s)
 

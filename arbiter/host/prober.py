@@ -191,37 +191,3 @@ class _Reader:
                 self._loop.call_soon_threadsafe(self._done, taken_at, outcome, lineages)
             except RuntimeError:
                 return  # the loop closed meanwhile
-
-
-async def within[T](deadline_s: float, call: Callable[[], T], what: str) -> T:
-    """Run a blocking call in a thread of its own. Raises what it raises, or ProbeFailed after
-    `deadline_s`."""
-    loop = asyncio.get_running_loop()
-    future: asyncio.Future[T] = loop.create_future()
-
-    def deliver(result: T | None, error: BaseException | None) -> None:
-        if future.done():
-            return
-        if error is not None:
-            future.set_exception(error)
-        else:
-            future.set_result(result)  # type: ignore[arg-type]  # no error: there is a result
-
-    def run() -> None:
-        result, failure = None, None
-        try:
-            result = call()
-        except BaseException as error:  # noqa: BLE001 - carried over to the caller
-            failure = error
-        try:
-            loop.call_soon_threadsafe(deliver, result, failure)
-        except RuntimeError:
-            pass  # the loop closed meanwhile
-
-    threading.Thread(target=run, name="probe-start", daemon=True).start()
-    try:
-        return await asyncio.wait_for(future, deadline_s)
-    except TimeoutError as error:
-        raise ProbeFailed(
-            f"{what} gave no answer within {deadline_s:g} s", hint="see dmesg and nvidia-smi"
-        ) from error

@@ -64,22 +64,17 @@ async def _run(args: argparse.Namespace) -> int:
     if args.memory < MEMORY_MIN_BYTES:
         raise ConfigError(f"--memory: expected at least {format_bytes(MEMORY_MIN_BYTES)}")
     gpu, why = await opened(args.gpu, args.memory)
-    simulated = gpu is None
-
-    def tell(outcome: JsonMap) -> None:
-        outcomes.append(outcome)
-        line = report.line_of(outcome, simulated=simulated)
-        print("\n".join(terminal.folded(line, 4, terminal.columns())), flush=True)
-
     async with made(gpu, args.memory, {row.skill for row in rows} - {""}) as bed:
         about = f"{bed.gpu.name}, {bed.gpu.driver}, at most {format_bytes(args.memory)} of it"
-        print(printable(about))
-        if simulated:
+        print(printable(about), flush=True)
+        if bed.simulated:
             print(printable(f"{report.SIMULATED} ({why})"), flush=True)
-        for row in rows:
-            tell(await judged(row, bed, deadline_s - time.monotonic()))
-        tell(await judged(LAST, bed, LAST.limit_s))
-    told = report.told(bed.gpu, outcomes, simulated=simulated)
+        for row in (*rows, LAST):
+            left_s = LAST.limit_s if row is LAST else deadline_s - time.monotonic()
+            outcomes.append(await judged(row, bed, left_s))
+            line = report.line_of(outcomes[-1], simulated=bed.simulated)
+            print("\n".join(terminal.folded(line, 4, terminal.columns())), flush=True)
+    told = report.told(bed.gpu, outcomes, simulated=bed.simulated)
     print(told["summary"])
     if args.json:
         files.replace(args.json, json.dumps(told, indent=2) + "\n")

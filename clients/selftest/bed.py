@@ -8,10 +8,9 @@ import json
 import os
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Collection
+from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from typing import Any, Final
 
 from vram_arbiter.clients.calibration.gpu import Gpu, Reading
@@ -20,10 +19,11 @@ from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.sidecar.build import CLIENTS
 from vram_arbiter.schemas.defaults import RESERVE_BYTES, VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
-from vram_arbiter.schemas.errors import ProbeFailed, SidecarUnavailable
+from vram_arbiter.schemas.errors import SidecarUnavailable
 from vram_arbiter.schemas.manifest import RSkillManifest, load_manifest
 from vram_arbiter.schemas.plain import JsonMap
-from vram_arbiter.schemas.runtime.threads import in_daemon_thread
+from vram_arbiter.schemas.runtime.extras import need
+from vram_arbiter.schemas.runtime.threads import answered_within
 from vram_arbiter.schemas.sizes import format_bytes
 
 READING_S: Final = 5.0
@@ -41,22 +41,6 @@ class Skipped(Exception):
 
 class Missed(Exception):
     """A row found something else than the product claims; the text says what."""
-
-
-def need(*packages: str) -> None:
-    """Raises Skipped where one of these packages of the sidecars is not installed."""
-    if not all(map(find_spec, packages)):
-        raise Skipped("install 'vram-arbiter[sidecars]'")
-
-
-async def answered_within[T](limit_s: float, work: Callable[[], T]) -> T:
-    """Do work of the driver, which may hang. Raises ProbeFailed after `limit_s`."""
-    try:
-        async with asyncio.timeout(limit_s):
-            return await in_daemon_thread(work, "driver")
-    except TimeoutError:
-        late = f"the driver gave no answer within {limit_s:g} s"
-        raise ProbeFailed(late, hint="see nvidia-smi and dmesg") from None
 
 
 async def ask(holder: Program, word: str, *sizes: int) -> JsonMap:
@@ -128,10 +112,10 @@ class Bed:
         under a lease of that name (`vramctl run`), or without one, which makes it a stowaway. Its
         bytes are back at the end of the block.
 
-        Raises Skipped, Missed, and SidecarUnavailable with the process's error.
+        Raises NotInstalled, Missed, and SidecarUnavailable with the process's error.
         """
         if not self.simulated:
-            need("torch")
+            need("the row", "torch", extra="sidecars")
         used_bytes, command = await self.used(), [HOLDER, self.gpu.device]
         if lease:
             need_of = ("--vram", f"{self.lease_bytes}B", "--gpu", self.gpu.uuid, "--name", lease)
@@ -152,9 +136,9 @@ class Bed:
         """Make the model of a shipped skill resident, and unload it again. Gives the client of its
         kind. All sidecars start at first use. Its bytes are back at the end of the block.
 
-        Raises Skipped, Missed, SidecarUnavailable, and the sidecar's errors.
+        Raises NotInstalled, Missed, SidecarUnavailable, and the sidecar's errors.
         """
-        need("torch", "transformers", "lerobot")
+        need("the row", "torch", "transformers", "lerobot", extra="sidecars")
         manifest = load_manifest(configs_folder(os.environ) / "rskills" / skill / "rskill.yaml")
         for name in sorted(set(self.skills) - set(self.programs.running)):
             await self.programs.start(

@@ -23,14 +23,14 @@ from vram_arbiter.clients.selftest.bed import (
     MODEL_S,
     Bed,
     Missed,
-    answered_within,
     ask,
-    need,
 )
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import MIB, VERIFY_TIMEOUT_S, VERIFY_TOLERANCE_BYTES
 from vram_arbiter.schemas.errors import VramError, WaitTimeout
 from vram_arbiter.schemas.manifest import RSkillManifest
+from vram_arbiter.schemas.runtime.extras import need
+from vram_arbiter.schemas.runtime.threads import answered_within
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
 type Found = tuple[float, str]
@@ -172,7 +172,7 @@ async def _rates(bed: Bed, *copies: str) -> list[float]:
 @row("", source="the CPU's answer", most=1e-3, hardware=True)
 async def nf4(bed: Bed) -> Found:
     """Measure the relative difference of NF4 on GPU and CPU."""
-    need("torch", "bitsandbytes")
+    need("the row", "torch", "bitsandbytes", extra="sidecars")
     async with bed.holder() as holder:
         told = await ask(holder, "nf4")
     if told["bytes"] * 8 != told["of_bytes"]:

@@ -11,12 +11,14 @@ from vram_arbiter.clients.calibration.gpu import Gpu, open_gpu
 from vram_arbiter.clients.cli.doctor.machine import ask_arbiter, ask_nvml
 from vram_arbiter.clients.cli.programs import private_arbiter
 from vram_arbiter.clients.net.link import is_listening
-from vram_arbiter.clients.selftest.bed import READING_S, Bed, Missed, Skipped, answered_within
+from vram_arbiter.clients.selftest.bed import READING_S, Bed, Missed, Skipped
 from vram_arbiter.clients.selftest.rows import Claim
 from vram_arbiter.schemas.defaults import RESERVE_BYTES
 from vram_arbiter.schemas.errors import CheckpointUnsupported, ConfigError
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime import endpoints
+from vram_arbiter.schemas.runtime.extras import NotInstalled
+from vram_arbiter.schemas.runtime.threads import answered_within
 from vram_arbiter.schemas.sizes import format_bytes
 
 type Verdict = Literal["pass", "miss", "failed", "skipped"]
@@ -103,7 +105,7 @@ async def judged(row: Claim, bed: Bed, left_s: float) -> JsonMap:
             measured, remark = await row.measure(bed)
         figure = float(f"{measured:.4g}")
         verdict = "pass" if not limit or row.least <= figure <= row.most else "miss"
-    except (Skipped, CheckpointUnsupported) as why:
+    except (Skipped, NotInstalled, CheckpointUnsupported) as why:
         verdict, remark = "skipped", str(why)
     except Missed as why:
         verdict, remark = "miss", str(why)

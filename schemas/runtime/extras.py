@@ -28,22 +28,26 @@ EXTRA_OF: Mapping[str, str] = {
 }
 
 
+class NotInstalled(ConfigError):
+    """A package is missing that an extra brings."""
+
+
 def need(what: str, *packages: str, extra: str) -> None:
-    """Raises ConfigError that names every one of `packages` that is not installed."""
+    """Raises NotInstalled that names every one of `packages` that is not installed."""
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
         raise not_installed(what, missing, extra)
 
 
-def not_installed(what: str, missing: list[str], extra: str) -> ConfigError:
+def not_installed(what: str, missing: list[str], extra: str) -> NotInstalled:
     packages = " or ".join(f"'vram-arbiter[{one}]'" for one in extra.split(" or "))
-    return ConfigError(
+    return NotInstalled(
         f"{what} needs {', '.join(missing)}, which this installation does not have",
         hint=f"pip install {packages}",
     )
 
 
-def explained(what: str, error: ModuleNotFoundError) -> ConfigError | None:
+def explained(what: str, error: ModuleNotFoundError) -> NotInstalled | None:
     """The operator's error behind an import that failed; None for a module that no extra brings:
     that is a defect."""
     root = (error.name or "").partition(".")[0]

@@ -15,14 +15,15 @@ from vram_arbiter.arbiter.host.gpu.fake import make_gpu
 from vram_arbiter.clients.calibration.gpu import Gpu, Reading, fake_gpu
 from vram_arbiter.clients.cli.programs import Programs
 from vram_arbiter.clients.selftest import report, rows
-from vram_arbiter.clients.selftest.bed import Bed, Missed, Skipped, answered_within, need
+from vram_arbiter.clients.selftest.bed import Bed, Missed, Skipped
 from vram_arbiter.clients.selftest.run import judged
 from vram_arbiter.schemas import fakegpu
 from vram_arbiter.schemas.defaults import GIB, MIB
-from vram_arbiter.schemas.errors import CheckpointUnsupported, NoGpu, ProbeFailed
+from vram_arbiter.schemas.errors import CheckpointUnsupported, NoGpu
 from vram_arbiter.schemas.ids import ProcessKey
 from vram_arbiter.schemas.plain import JsonMap
 from vram_arbiter.schemas.runtime import fakegpu_folder, procfs
+from vram_arbiter.schemas.runtime.extras import NotInstalled
 
 
 def bed_on(gpu: Gpu, folder: Path) -> Bed:
@@ -80,6 +81,7 @@ async def endless(bed: Bed) -> rows.Found:
         (row(partial(raised, Skipped("why"))), 9.0, "skipped", "why"),
         (row(partial(raised, Missed("what"))), 9.0, "miss", "what"),
         (row(partial(raised, CheckpointUnsupported("old"))), 9.0, "skipped", "old"),
+        (row(partial(raised, NotInstalled("torch"))), 9.0, "skipped", "torch"),
         (row(partial(raised, NoGpu("none"))), 9.0, "failed", "NoGpu: none"),
         (row(partial(raised, KeyError("x"))), 9.0, "failed", "KeyError: 'x'"),
     ],
@@ -97,17 +99,6 @@ def test_two_leases_of_all_that_can_be_leased_do_not_fit(bed: Bed) -> None:
     """What is used already, the reserve, and twice the tolerance are left out."""
     bed.found = Reading(GIB, {})
     assert bed.lease_bytes == 7 * GIB - 300 * MIB - 128 * MIB
-
-
-def test_what_a_row_needs_is_named() -> None:
-    with pytest.raises(Skipped, match=r"install 'vram-arbiter\[sidecars\]'"):
-        need("json", "no_such_package")
-
-
-def test_a_driver_that_hangs_is_left_behind() -> None:
-    """The program ends all the same: the thread is a daemon's."""
-    with pytest.raises(ProbeFailed, match="no answer within"):
-        asyncio.run(answered_within(0.01, lambda: time.sleep(1000)))
 
 
 def result(name: str, figure: float | None, limit: str, verdict: str, remark: str) -> JsonMap:
