@@ -7,7 +7,6 @@ raises. Whether each waiter can be served is told by the same graph: from every 
 (`serve`).
 """
 
-import gc
 import random
 import time
 from array import array
@@ -28,9 +27,6 @@ SERVE: Final = (
 SERVE_STEPS_MAX = 400
 SERVE_SHARE = 0.1
 """Of the time of a search that is cut: for serving those that wait at its edge."""
-COLLECT_EVERY = 20
-"""States between two collections of garbage: worlds hold circles, and memory that was used just now
-is fast."""
 
 
 @dataclass(slots=True)
@@ -111,27 +107,19 @@ class Search:
     def run(self, seconds: float, states_max: int = 1 << 31) -> Report:
         """Explore until everything is known, for some seconds, or up to a number of states."""
         report, began, cpu = self.report, time.perf_counter(), time.process_time()
-        gc.disable()
-        try:
-            until = began + seconds * (1 - SERVE_SHARE)
-            while self._edge and time.perf_counter() < until and not report.error:
-                if len(self._parents) >= states_max:
-                    break
-                self._expand(*self._edge.popleft())
-            report.complete = not self._edge
-            if not report.error:
-                self._check_served(began + seconds)
-        finally:
-            gc.unfreeze()
-            gc.enable()
+        until = began + seconds * (1 - SERVE_SHARE)
+        while self._edge and time.perf_counter() < until and not report.error:
+            if len(self._parents) >= states_max:
+                break
+            self._expand(*self._edge.popleft())
+        report.complete = not self._edge
+        if not report.error:
+            self._check_served(began + seconds)
         report.states, report.depth = len(self._parents), len(self.story(len(self._parents) - 1))
         report.wall_s, report.cpu_s = time.perf_counter() - began, time.process_time() - cpu
         return report
 
     def _expand(self, state: int, frozen: Frozen) -> None:
-        if state % COLLECT_EVERY == 0:
-            gc.collect()
-            gc.freeze()  # what waits at the edge is not looked at again
         world = thaw(frozen)
         for n, action in enumerate(world.actions()):
             world = thaw(frozen) if n else world
