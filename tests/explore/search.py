@@ -41,7 +41,6 @@ class Report:
     complete: bool = False
     served: int = 0
     unproven: int = 0
-    wall_s: float = 0.0
     cpu_s: float = 0.0
     verbs: Counter[str] = field(default_factory=Counter)
     story: list[Action] = field(default_factory=list)
@@ -97,8 +96,8 @@ class Search:
         self.report = Report(scenario.name)
         self._scenario, self._freezer = scenario, Freezer()
         self._known: dict[int, int] = {}
-        self._parents, self._steps = array("I"), array("H")
-        self._actions: dict[Action, int] = {}  # by which number they are steps
+        self._parents, self._steps = array("I"), list[Action]()
+        self._actions: dict[Action, Action] = {}  # one object for those that are equal
         self._edge = deque[tuple[int, Frozen]]()  # states that are met and not explored
         self._served = bytearray()  # 1: no client waits, or some path leads there
         self._paths = array("I")  # of SERVE actions: from, to, from, to, …
@@ -116,7 +115,7 @@ class Search:
         if not report.error:
             self._check_served(began + seconds)
         report.states, report.depth = len(self._parents), len(self.story(len(self._parents) - 1))
-        report.wall_s, report.cpu_s = time.perf_counter() - began, time.process_time() - cpu
+        report.cpu_s = time.process_time() - cpu
         return report
 
     def _expand(self, state: int, frozen: Frozen) -> None:
@@ -137,16 +136,16 @@ class Search:
         state = self._known.setdefault(fingerprint(world), len(self._parents))
         if state == len(self._parents):
             self._parents.append(parent)
-            self._steps.append(self._actions.setdefault(action, len(self._actions)))
+            self._steps.append(self._actions.setdefault(action, action))
             self._served.append(not world.waits())
             self._edge.append((state, self._freezer.freeze(world)))
         return state
 
     def story(self, state: int) -> list[Action]:
         """Return the shortest story that leads to a state."""
-        actions, steps = list(self._actions), list[Action]()
+        steps = list[Action]()
         while state:
-            steps.append(actions[self._steps[state]])
+            steps.append(self._steps[state])
             state = self._parents[state]
         return steps[::-1]
 

@@ -298,11 +298,6 @@ class Client:
         state = self.protocol.connection.phase, self.acquires, self.bytes, self.uses, self.leaves
         return *state, self.record is None, len(self.up), len(self.down)
 
-    def decisive_times(self) -> Iterator[float]:
-        """Yield when it gives up something."""
-        yield from self.protocol.waits.deadlines()
-        yield from map(self.protocol.holdings.fence_at, self.protocol.holdings.held.values())
-
     def coming_bytes(self, device: SimDevice) -> int:
         """Return what a grant lets it put on a GPU beyond what it holds, whatever the engine says:
         until it knows that it has lost the lease."""
@@ -509,7 +504,9 @@ class World:
     def _decisive_at(self) -> float:
         """Return when something is due that is not done again and again."""
         core = state_of(self.engine)
-        times = [at for one in self.clients.values() for at in one.decisive_times()]
+        times = [at for one in self.clients.values() for at in one.protocol.waits.deadlines()]
+        holdings = [one.protocol.holdings for one in self.clients.values()]
+        times += [some.fence_at(record) for some in holdings for record in some.held.values()]
         times += [at for (kind, _), at in core.timers.items() if kind not in _PERIODIC]
         debts = [debt for gpu in core.gpus.values() for debt in gpu.verifications.values()]
         times += [one.deadline_at + DYING_S * one.overdue for one in debts]
