@@ -10,7 +10,7 @@ raises. Whether each waiter can be served is told by the same graph: from every 
 import random
 import time
 from array import array
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
@@ -42,7 +42,7 @@ class Report:
     served: int = 0
     unproven: int = 0
     cpu_s: float = 0.0
-    verbs: Counter[str] = field(default_factory=Counter)
+    verbs: dict[str, int] = field(default_factory=dict)
     story: list[Action] = field(default_factory=list)
     error: str = ""
 
@@ -119,14 +119,14 @@ class Search:
         return report
 
     def _expand(self, state: int, frozen: Frozen) -> None:
-        world = thaw(frozen)
+        report, world = self.report, thaw(frozen)
         for n, action in enumerate(world.actions()):
             world = thaw(frozen) if n else world
             if error := _error_of(world, action):
                 self._fail(error, [*self.story(state), action])
                 return
-            self.report.transitions += 1
-            self.report.verbs[action[0]] += 1
+            report.transitions += 1
+            report.verbs[action[0]] = report.verbs.get(action[0], 0) + 1
             met = self._meet(world, state, action)
             if action[0] in SERVE and met != state:
                 self._paths.extend((state, met))
