@@ -10,7 +10,6 @@ so that a copy's closures speak of the copy.
 import io
 import pickle
 import sys
-from collections.abc import Callable
 from enum import Enum
 from functools import cache
 from itertools import count
@@ -77,39 +76,34 @@ def thaw(frozen: Frozen) -> World:
 class _Pickler(pickle.Pickler):
     def reducer_override(self, value: Any) -> Any:
         kind: type = type(value)
-        reduce = _reducer(kind)
-        return NotImplemented if reduce is None else reduce(value)
+        if _never_changes(kind):
+            _shared.append(value)
+            return _recall, (len(_shared) - 1,)
+        if kind is FunctionType and value.__closure__ is not None:
+            return _function, (value.__code__, value.__module__, value.__closure__)
+        if kind is CellType:
+            return _cell, (value.cell_contents,)
+        if kind is count:
+            return count, (int(repr(value)[len("count(") : -1]),)
+        return NotImplemented
 
 
 @cache
-def _reducer(kind: type) -> Callable[[Any], Any] | None:
-    """Return how objects of a class are pickled; None: as ever."""
+def _never_changes(kind: type) -> bool:
+    """Whether all copies share the objects of a class. A tuple of a class of its own is a named
+    one."""
     parameters = getattr(kind, "__dataclass_params__", None)
-    if (parameters is not None and parameters.frozen) or issubclass(kind, Enum | CodeType | tuple):
-        return _refer  # a tuple of a class of its own is a named one
-    return _OTHERS.get(kind)
-
-
-def _refer(value: object) -> Any:
-    """All copies share it."""
-    _shared.append(value)
-    return _recall, (len(_shared) - 1,)
-
-
-def _recall(n: int) -> object:
-    return _shared[n]
+    named = issubclass(kind, tuple) and kind is not tuple
+    return named or issubclass(kind, Enum | CodeType) or getattr(parameters, "frozen", False)
 
 
 def _is_word(thing: Any) -> bool:
     kind: type = type(thing)
-    return isinstance(thing, str | type) or (kind is not tuple and _reducer(kind) is _refer)
+    return isinstance(thing, str | type) or _never_changes(kind)
 
 
-# -- what pickle cannot do by itself
-def _reduce_function(function: FunctionType) -> Any:
-    if function.__closure__ is None:
-        return NotImplemented
-    return _function, (function.__code__, function.__module__, function.__closure__)
+def _recall(n: int) -> object:
+    return _shared[n]
 
 
 def _function(code: CodeType, module: str, cells: tuple[CellType, ...]) -> FunctionType:
@@ -118,10 +112,3 @@ def _function(code: CodeType, module: str, cells: tuple[CellType, ...]) -> Funct
 
 def _cell(contents: object) -> CellType:
     return CellType(contents)
-
-
-_OTHERS: dict[type, Callable[[Any], Any]] = {
-    FunctionType: _reduce_function,
-    CellType: lambda cell: (_cell, (cell.cell_contents,)),
-    count: lambda numbers: (count, (int(repr(numbers)[len("count(") : -1]),)),
-}

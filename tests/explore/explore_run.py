@@ -65,14 +65,9 @@ def main() -> int:
             reached |= lines
             print(report, flush=True)
     every, failed = lines_of_the_engine(), [one.scenario for one in reports if one.error]
-    total: dict[str, Any] = {
-        "states": sum(report.states for report in reports),
-        "transitions": sum(report.transitions for report in reports),
-        "complete": sum(report.complete for report in reports),
-        "failed": failed,
-        "lines": len(every),
-        "reached": len(every & reached),
-    }
+    counted = ("states", "transitions", "complete")
+    total: dict[str, Any] = {name: sum(getattr(one, name) for one in reports) for name in counted}
+    total |= {"failed": failed, "lines": len(every), "reached": len(every & reached)}
     print(json.dumps(total))
     total |= {"missed": sorted(every - reached), "worlds": [asdict(report) for report in reports]}
     options.out.parent.mkdir(parents=True, exist_ok=True)

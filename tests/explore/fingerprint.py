@@ -119,12 +119,8 @@ class _Part:
                 self.moments.append(len(row))
                 row.append(value)
             elif kind in _NAMED:
-                named = names.get(value)
-                if named is None and (
-                    kind is not str or (value[:1] == "L" and value[1:2].isdigit())
-                ):
-                    named = names[value] = len(names) + 1
-                row.append(value if named is None else named)
+                named = kind is not str or value[:1] == "L" or value in names  # a lease's id
+                row.append(self.name(value) if named else value)
             elif value:
                 _writer(kind)(self, value)
             else:

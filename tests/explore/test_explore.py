@@ -1,6 +1,9 @@
 """The explorer itself: a tiny world to its end, a seeded defect by its shortest story, and which
 worlds count as the same."""
 
+import json
+from dataclasses import asdict
+
 import pytest
 
 from tests.explore.cloning import Freezer, thaw
@@ -47,6 +50,7 @@ def test_a_tiny_world_is_explored_to_its_end() -> None:
     assert not report.error
     assert report.complete
     assert report.unproven == 0
+    assert json.loads(json.dumps(asdict(report)))["verbs"] == report.verbs
     assert {"acquire", "load", "ready", "use", "end", "leave", "free", "read"} <= set(report.verbs)
 
 

@@ -8,7 +8,6 @@ moment of its own, `STEP_S` after the one before; time passes otherwise only by 
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from math import inf
 from typing import Any
 
@@ -38,6 +37,9 @@ from vram_arbiter.schemas.wire.spec import LeaseSpec
 
 CAPACITY_BYTES, OVERHEAD_BYTES = 8 * d.GIB, 100 * d.MIB
 """Of each GPU; the driver's own."""
+GPUS = tuple(
+    GpuInfo(GpuId(f"GPU-{n}"), n, "", CAPACITY_BYTES, total_bytes=CAPACITY_BYTES) for n in range(2)
+)
 START_S, STEP_S = 1024.0, 2.0**-20
 FOR_EVER_S, FAR_S = 3600.0, 600.0
 """The longest time to live; what is due so much later is not waited for."""
@@ -150,9 +152,8 @@ class Client:
         elif self.bytes and (record is None or self.leaves):
             yield "free"
         elif record is None:
-            yield from (
-                ["cancel"] if self.protocol.waits.waiters else ["acquire"] * bool(self.acquires)
-            )
+            waits = self.protocol.waits.waiters
+            yield from ["cancel"] if waits else ["acquire"] * bool(self.acquires)
         elif not self.bytes:
             yield "load"
         elif not self._is_asking():
@@ -181,8 +182,7 @@ class Client:
             self.protocol.waits.cancel(nonce, world.now)
 
     def do_load(self, world: "World") -> None:
-        assert self.record is not None
-        self.gpu = GpuId(str(self.record.view.gpu))
+        self.gpu = GpuId(str(self._held.view.gpu))
         self._hold(world, self.spec.footprint.load_peak_bytes)
 
     def do_ready(self, world: "World") -> None:
@@ -298,11 +298,6 @@ class Client:
         state = self.protocol.connection.phase, self.acquires, self.bytes, self.uses, self.leaves
         return *state, self.record is None, len(self.up), len(self.down)
 
-    def decisive_times(self) -> Iterator[float]:
-        """Yield when it gives up something."""
-        yield from self.protocol.waits.deadlines()
-        yield from map(self.protocol.holdings.fence_at, self.protocol.holdings.held.values())
-
     def coming_bytes(self, device: SimDevice) -> int:
         """Return what a grant lets it put on a GPU beyond what it holds, whatever the engine says:
         until it knows that it has lost the lease."""
@@ -336,15 +331,6 @@ class Client:
                 raise Broken(f"{self.name} waits for {waiter.lease_id}, and the engine does not")
 
 
-@lru_cache(maxsize=64)
-def _settings(gpus: int, epoch: int) -> Settings:
-    infos = [
-        GpuInfo(GpuId(f"GPU-{n}"), n, "", CAPACITY_BYTES, total_bytes=CAPACITY_BYTES)
-        for n in range(gpus)
-    ]
-    return Settings(epoch=epoch, gpus=tuple(infos), **QUICK)
-
-
 class World:
     """See the module. `left`: how often each fault may still happen; `readings`: under way, one of
     each GPU (`host.prober`), and `again`: a question came after it began."""
@@ -357,7 +343,7 @@ class World:
         lag_s = LAG_S if scenario.lags else 0.0
         self.devices = {
             info.id: SimDevice(info.id, CAPACITY_BYTES, OVERHEAD_BYTES, lag_s, scenario.lists)
-            for info in _settings(scenario.gpus, 1).gpus
+            for info in GPUS[: scenario.gpus]
         }
         self.readings: dict[GpuId, ev.MemorySampled] = {}
         self.again = set[GpuId]()
@@ -397,7 +383,7 @@ class World:
 
     def act(self, action: Action) -> None:
         """Let something happen. Raises what must not be raised."""
-        (verb, whose), before = action, self.now
+        verb, whose = action
         if verb in self.left:
             self.left[verb] -= 1
         if whose in self.clients:
@@ -408,8 +394,7 @@ class World:
             self._deliver_readings()
         else:
             self._deliver_mail()
-        if self.now > before:  # the engine heard of it
-            check_arbiter(self.engine)
+        check_arbiter(self.engine)
         self._check(state_of(self.engine))
 
     def _deliver_mail(self) -> None:
@@ -463,7 +448,8 @@ class World:
     def do_restart(self) -> None:
         """The daemon starts, perhaps after an earlier one."""
         self.epoch += 1
-        self.engine = self.scenario.engine(_settings(self.scenario.gpus, self.epoch), self.now)
+        settings = Settings(epoch=self.epoch, gpus=GPUS[: self.scenario.gpus], **QUICK)
+        self.engine = self.scenario.engine(settings, self.now)
         self.readings.clear()
         self.again.clear()
         for client in self.clients.values():
@@ -508,8 +494,7 @@ class World:
         """Time passes to the next deadline, which is served."""
         self.now = max(self.now, self._next_at())
         for client in self.clients.values():
-            if (client.protocol.next_deadline() or inf) <= self.now:
-                client.act("tick", self)
+            client.act("tick", self)
         if (self.engine.next_deadline() or inf) <= self.now:
             self.post(ev.Tick())
 
@@ -518,7 +503,9 @@ class World:
     def _decisive_at(self) -> float:
         """Return when something is due that is not done again and again."""
         core = state_of(self.engine)
-        times = [at for one in self.clients.values() for at in one.decisive_times()]
+        times = [at for one in self.clients.values() for at in one.protocol.waits.deadlines()]
+        holdings = [one.protocol.holdings for one in self.clients.values()]
+        times += [some.fence_at(record) for some in holdings for record in some.held.values()]
         times += [at for (kind, _), at in core.timers.items() if kind not in _PERIODIC]
         debts = [debt for gpu in core.gpus.values() for debt in gpu.verifications.values()]
         times += [one.deadline_at + DYING_S * one.overdue for one in debts]
