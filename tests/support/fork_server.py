@@ -53,7 +53,7 @@ def lend() -> None:
     util.spawnv_passfds = spawn  # type: ignore[assignment]  # the stub takes numbers as arguments
 
 
-def place(descriptors: Sequence[int], numbers: Sequence[int]) -> None:
+def place_descriptors(descriptors: Sequence[int], numbers: Sequence[int]) -> None:
     """Move descriptors to these numbers."""
     aside = [fcntl.fcntl(one, fcntl.F_DUPFD_CLOEXEC, _ABOVE) for one in descriptors]
     for one in descriptors:
@@ -71,7 +71,7 @@ def _run_server(ordered: socket.socket) -> NoReturn:
         ordered.close()
         if text:
             order = json.loads(text)
-            place(descriptors, order["passed"])
+            place_descriptors(descriptors, order["passed"])
             os.environ.clear()
             os.environ.update(order["environ"])
             exec(order["code"], {})

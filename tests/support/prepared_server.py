@@ -96,7 +96,7 @@ class _Server:
 
 
 def _become(order: Order, given: Sequence[int]) -> None:
-    fork_server.place(given, order["numbers"])
+    fork_server.place_descriptors(given, order["numbers"])
     if order["session"]:
         os.setsid()
     os.environ.clear()
