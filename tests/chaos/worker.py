@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.support.attacks import ATTACKS
+from tests.support.saying import say, told_lines
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.schemas.defaults import MIB
@@ -211,8 +212,8 @@ async def take_bytes(gpu_folder: Path, trace: Trace, size: int) -> None:
         trace.say("took", bytes=size)
     except SimulatedOutOfMemory:
         trace.say("no_room", bytes=size)
-    print(json.dumps({"event": "took"}), flush=True)
-    await (await lines()).readline()
+    say("took")
+    await (await told_lines()).readline()
     memory.close()
     trace.say("done")
 
@@ -220,7 +221,7 @@ async def take_bytes(gpu_folder: Path, trace: Trace, size: int) -> None:
 async def mark_uses(trace: Trace) -> None:
     """Like a runner: marks a use on the lease of whoever it is told of (`LEASE EPOCH SERIAL`), by
     its token."""
-    reader = await lines()
+    reader = await told_lines()
     async with AsyncClient(name="user", connect_timeout_s=CONNECT_S) as client:
         while line := await reader.readline():
             lease_id, epoch, serial = line.decode().split()
@@ -232,14 +233,6 @@ async def mark_uses(trace: Trace) -> None:
             except VramError as error:
                 trace.say("refused", lease_id=lease_id, code=error.code)
     trace.say("done")
-
-
-async def lines() -> asyncio.StreamReader:
-    reader = asyncio.StreamReader()
-    await asyncio.get_running_loop().connect_read_pipe(
-        lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
-    )
-    return reader
 
 
 def main() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter
 
-from tests.support.serving import serving
+from tests.support.serving import answering
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.defaults import MESSAGE_MAX_BYTES
@@ -85,7 +85,7 @@ RESULT = {"status": "succeeded", "success": True, "code": "", "message": "", "da
 async def fake() -> AsyncIterator[FakeRunner]:
     with tempfile.TemporaryDirectory(prefix="rc") as folder:
         runner = FakeRunner(f"ipc://{folder}/r.sock")
-        async with serving(runner.server, runner.handle):
+        async with answering(runner.server, runner.handle):
             yield runner
 
 

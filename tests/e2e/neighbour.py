@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tests.support.saying import say
+from tests.support.saying import say, told_lines
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
@@ -25,10 +25,7 @@ TTL_S = 120.0  # one that is stopped for a while, on a busy machine, has its lea
 
 
 async def live(name: str, size: int, gpu_folder: Path, habits: dict[str, Any]) -> None:
-    reader = asyncio.StreamReader()
-    await asyncio.get_running_loop().connect_read_pipe(
-        lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
-    )
+    reader = await told_lines()
     memory = FakeMemory(gpu_folder, name, RESIDUE)
     blocks: list[Block] = []
 

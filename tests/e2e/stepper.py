@@ -10,7 +10,7 @@ import asyncio
 import sys
 from pathlib import Path
 
-from tests.support.saying import say
+from tests.support.saying import say, told_lines
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 from vram_arbiter.sidecars.device.fake import FakeMemory
@@ -21,10 +21,7 @@ TTL_S = 120.0
 
 
 async def live(name: str, size: int, gpu_folder: Path, residue: int) -> None:
-    reader = asyncio.StreamReader()
-    await asyncio.get_running_loop().connect_read_pipe(
-        lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
-    )
+    reader = await told_lines()
     told: asyncio.Queue[str] = asyncio.Queue()
 
     async def listen() -> None:

@@ -1,6 +1,6 @@
 """Hostile clients against a real daemon: whatever they do, the one honest holder keeps its lease
 and its answers, and when they are gone nothing of them is left: no session, no lease, no
-descriptor, no memory.
+descriptor, no memory. Floods and readers that do not read are in test_attacked_daemon.py.
 """
 
 import json
@@ -58,57 +58,7 @@ def report_of(attacker: "subprocess.Popen[str]") -> dict[str, Any]:
     return found
 
 
-# -- floods
-def test_a_flood_from_another_process_does_not_silence_others(honest: Honest) -> None:
-    flood = attack(
-        honest.arbiter,
-        """
-client = WireClient(endpoint).hello("flood")
-done(flooding=True)
-frame = msgpack.packb({"op": "status", "id": 1})
-while True:
-    client.send_raw(frame)
-    while client.receive(0) is not None:
-        pass
-""",
-    )
-    assert flood.stdout.readline(), "it floods"
-    for _ in range(20):
-        honest.is_served()
-    flood.kill()
-    flood.communicate()
-    honest.is_alone()
-
-
-def test_one_that_never_reads_loses_its_answers_and_costs_nobody_else(
-    honest: Honest, connect: Connect
-) -> None:
-    deaf = attack(
-        honest.arbiter,
-        """
-client = WireClient(endpoint).hello("deaf")
-client.socket.setsockopt(zmq.SNDTIMEO, 200)
-assert client.ask("subscribe")["ok"]
-frame = msgpack.packb({"op": "status", "id": 1})
-sent = 0
-try:
-    for sent in range(200_000):
-        client.send_raw(frame)
-except zmq.Again:
-    pass
-done(sent=sent)
-sys.stdin.readline()
-""",
-    )
-    assert deaf.stdout.readline(), "it has sent all that it could"
-    for _ in range(10):
-        honest.is_served()
-    assert deaf.poll() is None
-    deaf.kill()
-    deaf.communicate()
-    honest.is_alone()
-
-
+# -- connections
 def test_a_thousand_hellos_that_vanish_leave_nothing(honest: Honest) -> None:
     hasty = attack(
         honest.arbiter,

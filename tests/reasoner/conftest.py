@@ -12,7 +12,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from tests.support.field_server import PNG
-from tests.support.serving import serving
+from tests.support.serving import answering
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.runner import RunnerClient
 from vram_arbiter.schemas.errors import BadRequest, FrameStale, GoalRejected, VramError
@@ -202,7 +202,7 @@ class Sidecar:
 
 @asynccontextmanager
 async def _served(program: Any) -> AsyncIterator[Any]:
-    async with serving(program.server, program.handle):
+    async with answering(program.server, program.handle):
         yield program
 
 

@@ -127,6 +127,17 @@ def clock() -> ManualClock:
     return ManualClock()
 
 
+@pytest.fixture
+def programs() -> Iterator[list[Any]]:
+    """Processes of a test, which end with it."""
+    started: list[Any] = []
+    yield started
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
 @pytest.fixture(scope="session")
 def make_env() -> type[KinematicEnv]:
     return KinematicEnv

@@ -64,28 +64,19 @@ def test_goal_params_are_a_json_object() -> None:
         ("execute_rskill", "{", "the arguments are not JSON"),
         ("execute_rskill", "[]", "the arguments are not a JSON object"),
         ("execute_rskill", "", "rskill_id: Field required"),
-        (
-            "execute_rskill",
-            {"rskill_id": "a", "deadline_s": -1},
-            "deadline_s: Input should be greater",
-        ),
-        (
-            "execute_rskill",
-            {"rskill_id": "a", "goal_params_json": "[1]"},
-            "goal_params_json: .*a JSON object",
-        ),
-        (
-            "execute_rskill",
-            {"rskill_id": "a", "goal_params_json": "x"},
-            "goal_params_json: .*a JSON object",
-        ),
+        ("execute_rskill", {"rskill_id": "a", "deadline_s": -1},
+         "deadline_s: Input should be greater"),
+        ("execute_rskill", {"rskill_id": "a", "goal_params_json": "[1]"},
+         "goal_params_json: .*a JSON object"),
+        ("execute_rskill", {"rskill_id": "a", "goal_params_json": "x"},
+         "goal_params_json: .*a JSON object"),
         ("execute_rskill", {"rskill_id": "a", "patience_s": 0}, "patience_s: "),
         ("locate_in_view", {"query": ""}, "query: "),
         ("locate_in_view", {"query": "x", "zoom": 2}, "zoom: Extra"),
         ("lifecycle_transition", {"node": "x", "transition": "shutdown"}, "transition: "),
         ("emit_prompt", {"target_topic": "operator", "text": "x"}, "target_topic: "),
     ],
-)
+)  # fmt: skip
 def test_wrong_arguments_are_named(
     name: str, arguments: str | dict[str, Any], message: str
 ) -> None:

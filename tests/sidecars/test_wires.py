@@ -120,42 +120,25 @@ def test_others_of_the_group_do_not_end_it():
         ({"op": "detect", "image": "text", "query": "x", "colour": 1}, "bad_request", "colour"),
         ({"op": "detect", "image": PNG, "query": ""}, "bad_request", "query.text: String should"),
         ({"op": "detect", "image": PNG, "query": []}, "bad_request", "query.list: List should"),
-        (
-            {"op": "detect", "image": PNG, "query": ["cup"] * 200},
-            "bad_request",
-            "query.list: List should have at most 64 items after validation, not 200",
-        ),
+        ({"op": "detect", "image": PNG, "query": ["cup"] * 200}, "bad_request",
+         "query.list: List should have at most 64 items after validation, not 200"),
         ({"op": "detect", "image": PNG, "query": ["cup", 1]}, "bad_request", "query.list.1: Input"),
-        (
-            {"op": "detect", "image": PNG, "query": "x", "max_side": 10**9},
-            "bad_request",
-            "max_side",
-        ),
+        ({"op": "detect", "image": PNG, "query": "x", "max_side": 10**9}, "bad_request",
+         "max_side"),
         ({"op": "detect", "image": PNG, "query": "x", "token": [1]}, "bad_request", "token"),
-        (
-            {"op": "detect", "image": PNG, "query": "x", "score_threshold": float("nan")},
-            "bad_request",
-            "score_threshold",
-        ),
+        ({"op": "detect", "image": PNG, "query": "x", "score_threshold": float("nan")},
+         "bad_request", "score_threshold"),
         ({"op": "load", "timeout_s": -1}, "bad_request", "timeout_s"),
         ({"op": "load", "timeout_s": float("inf")}, "bad_request", "timeout_s"),
-        (
-            {"endpoint": "load", "data": {"timeout_s": "soon"}},
-            "bad_request",
-            "load: data.timeout_s: ",
-        ),
+        ({"endpoint": "load", "data": {"timeout_s": "soon"}}, "bad_request",
+         "load: data.timeout_s: "),
         ({"endpoint": "get_action", "data": [1]}, "bad_request", "data"),
         ({"op": "ping", "id": 1, "token": 7}, "bad_request", "token"),
-        (
-            {
-                "endpoint": "get_action",
-                "rtc": {"left_over": [], "inference_delay": 1, "execution_horizon": 1},
-            },
-            "bad_request",
-            "left_over",
-        ),
+        ({"endpoint": "get_action",
+          "rtc": {"left_over": [], "inference_delay": 1, "execution_horizon": 1}},
+         "bad_request", "left_over"),
     ],
-)
+)  # fmt: skip
 def test_a_bad_message_gets_a_typed_error_that_names_the_field(message, code, told):
     (reply,), host = talk({"id": 1, **message})
     assert (reply.get("ok", False), reply["code"]) == (False, code)

@@ -53,6 +53,16 @@ def lend() -> None:
     util.spawnv_passfds = spawn  # type: ignore[assignment]  # the stub takes numbers as arguments
 
 
+def place_descriptors(descriptors: Sequence[int], numbers: Sequence[int]) -> None:
+    """Move descriptors to these numbers."""
+    aside = [fcntl.fcntl(one, fcntl.F_DUPFD_CLOEXEC, _ABOVE) for one in descriptors]
+    for one in descriptors:
+        os.close(one)
+    for number, one in zip(numbers, aside, strict=True):
+        os.dup2(one, number)
+        os.close(one)
+
+
 def _run_server(ordered: socket.socket) -> NoReturn:
     """Run the server; end with the program where it starts none."""
     code = 1
@@ -61,12 +71,7 @@ def _run_server(ordered: socket.socket) -> NoReturn:
         ordered.close()
         if text:
             order = json.loads(text)
-            aside = [fcntl.fcntl(one, fcntl.F_DUPFD_CLOEXEC, _ABOVE) for one in descriptors]
-            for one in descriptors:
-                os.close(one)
-            for number, one in zip(order["passed"], aside, strict=True):
-                os.dup2(one, number)
-                os.close(one)
+            place_descriptors(descriptors, order["passed"])
             os.environ.clear()
             os.environ.update(order["environ"])
             exec(order["code"], {})

@@ -1,7 +1,6 @@
 """Server that imports a program, and forks it for each order of `prepared`; started by that."""
 
 import contextlib
-import fcntl
 import gc
 import json
 import os
@@ -15,9 +14,6 @@ from typing import Any
 
 from tests.support import fork_server
 from tests.support.prepared import DESCRIPTORS_MAX, HELLO, MESSAGE_MAX, PATIENCE_S, PROGRAMS
-
-ABOVE = 512
-"""Numbers of descriptors that none of the passed ones has."""
 
 type Order = dict[str, Any]
 
@@ -100,12 +96,7 @@ class _Server:
 
 
 def _become(order: Order, given: Sequence[int]) -> None:
-    aside = [fcntl.fcntl(one, fcntl.F_DUPFD_CLOEXEC, ABOVE) for one in given]
-    for one in given:
-        os.close(one)
-    for number, one in zip(order["numbers"], aside, strict=True):
-        os.dup2(one, number)
-        os.close(one)
+    fork_server.place_descriptors(given, order["numbers"])
     if order["session"]:
         os.setsid()
     os.environ.clear()

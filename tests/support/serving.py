@@ -8,7 +8,7 @@ from vram_arbiter.clients.net.server import Handler, RouterServer
 
 
 @asynccontextmanager
-async def serving(server: RouterServer, handle: Handler) -> AsyncIterator[RouterServer]:
+async def answering(server: RouterServer, handle: Handler) -> AsyncIterator[RouterServer]:
     """Answer with `handle` until the end of the block."""
     async with server:
         task = asyncio.create_task(server.serve(handle))

@@ -81,19 +81,14 @@ def test_a_field_that_came_later_takes_its_default(busy: CoreDriver) -> None:
         ("Tick", {"colour": 1}, "Tick has no field colour"),
         ("ClientLeft", {"client": "c"}, "ClientLeft lacks reason"),
         ("Tick", [], "Tick: expected a map"),
-        (
-            "Asked",
-            {"client": "c", "id": 1, "request": {"op": "unloading", "lease_id": "L", "token": [1]}},
-            "expected a list of 2",
-        ),
+        ("Asked",
+         {"client": "c", "id": 1, "request": {"op": "unloading", "lease_id": "L", "token": [1]}},
+         "expected a list of 2"),
         ("Asked", {"client": "c", "id": 1, "request": {"op": "bye", "why": 1}}, "no field why"),
-        (
-            "Asked",
-            {"client": "c", "id": 1, "request": {"op": "dance"}},
-            "expected one of several kinds",
-        ),
+        ("Asked", {"client": "c", "id": 1, "request": {"op": "dance"}},
+         "expected one of several kinds"),
     ],
-)
+)  # fmt: skip
 def test_a_log_of_another_version_says_what_is_strange(name: str, data: Any, says: str) -> None:
     with pytest.raises(CodecError, match=says):
         decode_event(name, data)

@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.leases import Spec
 from tests.support.process import ArbiterProcess
-from tests.support.serving import serving
+from tests.support.serving import answering
 from vram_arbiter.clients._protocol import traces
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.lease import AsyncLease
@@ -143,7 +143,7 @@ def test_goals_and_sidecars_requests_carry_it(tmp_path: Path) -> None:
             heard[str(message.get("op") or message.get("endpoint"))] = message
             await server.send(peer, {"re": message["id"], "ok": True, "action": []})
 
-        async with serving(server, answer):
+        async with answering(server, answer):
             runner, policy = RunnerClient(server.endpoint), PolicyClient(server.endpoint)
             with tracing.joined(PARENT):
                 await runner.send_goal("a/skill")

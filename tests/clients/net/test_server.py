@@ -9,7 +9,7 @@ import msgpack
 import pytest
 import zmq
 
-from tests.support.serving import serving
+from tests.support.serving import answering
 from tests.support.wire import WireClient
 from vram_arbiter.clients.net.server import Peer, RouterServer, check_free
 from vram_arbiter.clients.runner import RunnerClient
@@ -36,7 +36,7 @@ def test_the_last_answer_reaches_its_peer_though_the_server_ends_behind_it(tmp_p
             await server.send(peer, {"re": message["id"], "data": ANSWER})
             answered.set()
 
-        async with serving(server, handle):
+        async with answering(server, handle):
             await answered.wait()
 
     with WireClient(endpoint) as client:
@@ -60,7 +60,7 @@ def test_a_late_answer_is_in_the_envelope_of_its_own_request(tmp_path: Path) -> 
                 for asker, request in waiting:
                     await server.send(asker, {"answer": request["n"]})
 
-        async with serving(server, handle):
+        async with answering(server, handle):
             with zmq.Context.instance().socket(zmq.REQ) as socket:
                 for option in (zmq.REQ_CORRELATE, zmq.REQ_RELAXED):
                     socket.setsockopt(option, 1)
@@ -90,7 +90,7 @@ def test_words_that_utf8_has_no_bytes_for_reach_the_other_side(tmp_path: Path) -
             answer = {"ok": True} if message["op"] == "ping" else failed
             await server.send(peer, {"re": message["id"], **answer})
 
-        async with serving(server, handle), RunnerClient(endpoint) as client:
+        async with answering(server, handle), RunnerClient(endpoint) as client:
             with pytest.raises(RobotFault) as raised:
                 await client.call(CancelGoal(goal_id="smoke \udcff"))
         return heard[-1], raised.value.message

@@ -20,7 +20,7 @@ import zmq
 import zmq.asyncio
 
 from tests.support.prepared import run
-from tests.support.serving import serving
+from tests.support.serving import answering
 from tests.support.waiting import PATIENCE_S, eventually
 from vram_arbiter.clients.net.server import (
     IMAGES_MAX_BYTES,
@@ -64,7 +64,7 @@ class Server:
 async def router_at(path: Path, **options: Any) -> AsyncIterator[Server]:
     router = RouterServer(f"ipc://{path}", refused, **options)
     server = Server(router)
-    async with serving(router, server.handle):
+    async with answering(router, server.handle):
         try:
             yield server
         finally:

@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.field_server import PNG, FieldServer
 from tests.support.pictures import encoded
-from tests.support.serving import serving
+from tests.support.serving import answering
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.sidecar.field import grounded
 from vram_arbiter.clients.sidecar.perception import (
@@ -202,7 +202,7 @@ async def test_a_server_may_be_replaced_by_one_of_the_other_kind(short_folder: P
             reply = {"ok": True, "answer": f"{message.get('token')}", "re": message["id"]}
             await server.send(peer, reply)
 
-        async with serving(server, handle):
+        async with answering(server, handle):
             return await client.query(PNG, "?", token=(1, 2))
 
     async with SceneVlmClient(endpoint) as client:

@@ -10,7 +10,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +49,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def deploy(tmp_path: Path, video: Path) -> Iterator[Start]:
-    started: list[prepared.Forked] = []
-
+def deploy(tmp_path: Path, video: Path, programs: list[prepared.Forked]) -> Start:
     def begin(
         *flags: str,
         more: str = "",
@@ -76,14 +74,10 @@ def deploy(tmp_path: Path, video: Path) -> Iterator[Start]:
         skills = str(ROOT / "configs/rskills/so101-navigate")
         argv = ["deploy", "--config", str(config), "--skills", skills, "--no-arbiter", *flags]
         process = prepared.start("deploy-nod", argv, environ, cwd=tmp_path)
-        started.append(process)
+        programs.append(process)
         return process
 
-    yield begin
-    for process in started:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+    return begin
 
 
 @contextlib.asynccontextmanager

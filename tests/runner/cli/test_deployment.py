@@ -206,63 +206,35 @@ def test_a_policys_vectors_are_told_where_it_fits(dry_run: DryRun) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (
-            "robot_id: bench\nhal: {adaptor: x}\n",
-            r"robot\.yaml:2: hal\.adaptor: unknown key; did you mean adapter",
-        ),
-        (
-            "robot_id: bench\nhal:\n  adapter: so100\n",
-            r"robot\.yaml:3: hal\.adapter: unknown adapter 'so100'",
-        ),
-        (
-            (
-                "robot_id: bench\nhal:\n  adapter: so101_kinematic\n  params:\n    start_pose_rad:"
-                " {elbow: 1}\n"
-            ),
-            r"robot\.yaml:5: hal\.params\.start_pose_rad\.elbow: no such joint",
-        ),
-        (
-            TWIN + "safety:\n  max_joint_speed_factor: -1\n",
-            r"robot\.yaml:4: safety\.max_joint_speed_factor: must be above 0",
-        ),
+        ("robot_id: bench\nhal: {adaptor: x}\n",
+         r"robot\.yaml:2: hal\.adaptor: unknown key; did you mean adapter"),
+        ("robot_id: bench\nhal:\n  adapter: so100\n",
+         r"robot\.yaml:3: hal\.adapter: unknown adapter 'so100'"),
+        ("robot_id: bench\nhal:\n  adapter: so101_kinematic\n  params:\n"
+         "    start_pose_rad: {elbow: 1}\n",
+         r"robot\.yaml:5: hal\.params\.start_pose_rad\.elbow: no such joint"),
+        (TWIN + "safety:\n  max_joint_speed_factor: -1\n",
+         r"robot\.yaml:4: safety\.max_joint_speed_factor: must be above 0"),
         (TWIN + "save_dir: /\n", r"robot\.yaml:3: save_dir: / is not empty, and no dataset"),
-        (
-            TWIN + "save_dir: /tmp/none\nrate_hz: 12.5\n",
-            (
-                r"robot\.yaml:3: save_dir: a recording needs a whole number of ticks a second, not"
-                r" 12\.5"
-            ),
-        ),
-        (
-            TWIN + "sensors:\n  - {sensor_id: joint_state, backend_params: {device: 0}}\n",
-            r"robot\.yaml:4: sensors\[0\]\.sensor_id: .* joint_state",
-        ),
+        (TWIN + "save_dir: /tmp/none\nrate_hz: 12.5\n",
+         r"robot\.yaml:3: save_dir: a recording needs a whole number of ticks a second, not 12\.5"),
+        (TWIN + "sensors:\n  - {sensor_id: joint_state, backend_params: {device: 0}}\n",
+         r"robot\.yaml:4: sensors\[0\]\.sensor_id: .* joint_state"),
         (TWIN + "rate_hz: 0\n", r"robot\.yaml:3: rate_hz: "),
-        (
-            TWIN + "task: {id: t}\nvla:\n  id: no/such\n",
-            r"robot\.yaml:5: vla\.id: no skill 'no/such' is installed",
-        ),
-        (
-            TWIN + "task: {id: t}\nvla:\n  id: vram-arbiter/so101-navigate\n",
-            (
-                r"robot\.yaml:5: vla\.id: vram-arbiter/so101-navigate is not offered here: it is"
-                r" made"
-                r" for mobile_base; this robot is so101_follower"
-            ),
-        ),
-        (
-            TWIN + "embodiment_tags: [mobile_base]\ntask: {id: t}\nvla:\n  id: "
-            "vram-arbiter/so101-navigate\n",
-            r"robot\.yaml:6: vla\.id: .* is not offered here: this runner stands in for "
-            r"control_msgs/FollowJointTrajectory, not for nav2_msgs/NavigateToPose",
-        ),
-        (
-            TWIN + "embodiment_tags: [any]\n",
-            r"robot\.yaml:1: .*'any' is what a skill may be made for, not what a robot is",
-        ),
+        (TWIN + "task: {id: t}\nvla:\n  id: no/such\n",
+         r"robot\.yaml:5: vla\.id: no skill 'no/such' is installed"),
+        (TWIN + "task: {id: t}\nvla:\n  id: vram-arbiter/so101-navigate\n",
+         r"robot\.yaml:5: vla\.id: vram-arbiter/so101-navigate is not offered here: it is made "
+         r"for mobile_base; this robot is so101_follower"),
+        (TWIN + "embodiment_tags: [mobile_base]\ntask: {id: t}\n"
+         "vla:\n  id: vram-arbiter/so101-navigate\n",
+         r"robot\.yaml:6: vla\.id: .* is not offered here: this runner stands in for "
+         r"control_msgs/FollowJointTrajectory, not for nav2_msgs/NavigateToPose"),
+        (TWIN + "embodiment_tags: [any]\n",
+         r"robot\.yaml:1: .*'any' is what a skill may be made for, not what a robot is"),
         (TWIN + "embodiment_tags: [5]\n", r"robot\.yaml:3: embodiment_tags\[0\]: "),
     ],
-)
+)  # fmt: skip
 def test_mistakes_are_named_by_line_and_field(dry_run: DryRun, text: str, said: str) -> None:
     code, out, err = dry_run(text)
     assert (code, out) == (2, "")

@@ -7,7 +7,7 @@ import contextlib
 import fcntl
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -29,20 +29,14 @@ pytestmark = pytest.mark.anyio
 
 
 @pytest.fixture
-def start_runner(tmp_path: Path) -> Iterator[Callable[..., Forked]]:
-    started: list[Forked] = []
-
+def start_runner(tmp_path: Path, programs: list[Forked]) -> Callable[..., Forked]:
     def begin(*flags: str) -> Forked:
         environ = os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path), "OMP_NUM_THREADS": "1"}
         argv = ["sim", "--skills", str(ROOT / "configs/rskills/so101-navigate"), *flags]
-        started.append(start("vram-runner", argv, environ, cwd=ROOT))
-        return started[-1]
+        programs.append(start("vram-runner", argv, environ, cwd=ROOT))
+        return programs[-1]
 
-    yield begin
-    for process in started:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+    return begin
 
 
 @pytest.mark.heavy

@@ -7,7 +7,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -36,9 +36,7 @@ type Start = Callable[..., Started]
 
 
 @pytest.fixture
-def start_recording(tmp_path: Path) -> Iterator[Start]:
-    started: list[Started] = []
-
+def start_recording(tmp_path: Path, programs: list[Started]) -> Start:
     def begin(program: str, *argv: str, afresh: bool = False, **environ: str) -> Started:
         given = (
             os.environ | {"VRAM_ARBITER_RUNTIME": str(tmp_path), "OMP_NUM_THREADS": "1"} | environ
@@ -47,16 +45,12 @@ def start_recording(tmp_path: Path) -> Iterator[Start]:
         words = [*argv, *skills]
         if afresh:
             command = [sys.executable, "-m", "vram_arbiter.runner", *words]
-            started.append(subprocess.Popen(command, cwd=tmp_path, env=given))
+            programs.append(subprocess.Popen(command, cwd=tmp_path, env=given))
         else:
-            started.append(start(program, words, given, cwd=tmp_path))
-        return started[-1]
+            programs.append(start(program, words, given, cwd=tmp_path))
+        return programs[-1]
 
-    yield begin
-    for process in started:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+    return begin
 
 
 @pytest.mark.nightly  # each step of a crash is in test_commit

@@ -5,6 +5,7 @@ opened.
 from typing import Any
 
 import pytest
+import yaml
 
 from vram_arbiter.runner.robots.factory import make_hal
 from vram_arbiter.runner.robots.kinematic import KinematicTwin
@@ -12,7 +13,9 @@ from vram_arbiter.runner.robots.units import JointUnit, Scale, scale_of_unit
 from vram_arbiter.schemas.config.robot import HalConfig
 from vram_arbiter.schemas.errors import ConfigError
 
-PANDA_JOINT = {"panda_joint1": {"max_speed_rad_s": 2.0}}
+HEAVY = pytest.mark.heavy
+PANDA = "model: panda_mobile"
+JOINT = "joints: {panda_joint1: {max_speed_rad_s: 2.0}}"
 
 
 def fields(adapter: str, **sections: dict[str, Any]) -> list[tuple[str, str]]:
@@ -23,107 +26,38 @@ def fields(adapter: str, **sections: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(
-    ("adapter", "sections", "field", "said"),
+    ("adapter", "section", "field", "said"),
     [
-        ("so101_mujocu", {}, "adapter", "did you mean so101_mujoco"),
-        ("lerobot", {}, "adapter", "unknown adapter"),
-        (
-            "so101_kinematic",
-            {"transport": {"port": "/dev/ttyACM0"}},
-            "transport.port",
-            "no transport",
-        ),
-        (
-            "so101_kinematic",
-            {"params": {"start_pose": {}}},
-            "params.start_pose",
-            "did you mean start_pose_rad",
-        ),
-        (
-            "so101_kinematic",
-            {"params": {"start_pose_rad": {"elbow": 0.1}}},
-            "params.start_pose_rad.elbow",
-            "elbow_flex",
-        ),
-        (
-            "so101_kinematic",
-            {"params": {"start_pose_rad": {"gripper": float("nan")}}},
-            "params.start_pose_rad.gripper",
-            "finite",
-        ),
-        (
-            "so101_kinematic",
-            {"params": {"start_pose_rad": {"gripper": 3.0}}},
-            "params.start_pose_rad.gripper",
-            "outside",
-        ),
-        (
-            "lerobot:so101_follower",
-            {"params": {"joints": {"gripper": {"unit": "furlongs"}}}},
-            "params.joints.gripper.unit",
-            "deg",
-        ),
-        (
-            "lerobot:so101_follower",
-            {"params": {"joints": {"gripper": {"lower_rad": 1, "upper_rad": 0}}}},
-            "params.joints.gripper",
-            "lower_rad must be below",
-        ),
-        (
-            "lerobot:so101_follower",
-            {"params": {"joints": {"gripper": {"sing": 1}}}},
-            "params.joints.gripper.sing",
-            "sign",
-        ),
-        ("lerobot:so101_follower", {"params": {"estop": "pray"}}, "params.estop", "hold"),
-        (
-            "mujoco",
-            {"params": {"joints": PANDA_JOINT}},
-            "params.model",
-            "give the robot's MJCF",
-        ),
-        (
-            "mujoco",
-            {"params": {"joints": PANDA_JOINT, "model": "pandas"}},
-            "params.model",
-            "no such file: pandas",
-        ),
-        pytest.param(
-            "mujoco",
-            {"params": {"joints": {"elbow": {"max_speed_rad_s": 1}}, "model": "panda_mobile"}},
-            "params.model",
-            "has no joint elbow",
-            marks=pytest.mark.heavy,
-        ),
-        pytest.param(
-            "mujoco",
-            {
-                "params": {
-                    "joints": {"panda_joint1": {"max_speed_rad_s": 1, "lower_rad": 3}},
-                    "model": "panda_mobile",
-                }
-            },
-            "params.joints.panda_joint1",
-            "is empty",
-            marks=pytest.mark.heavy,
-        ),
-        pytest.param(
-            "mujoco",
-            {
-                "params": {
-                    "joints": PANDA_JOINT,
-                    "model": "panda_mobile",
-                    "ends": {"hand": {"frame": "panda_hend"}},
-                }
-            },
-            "params.ends.hand.frame",
-            "panda_hand",
-            marks=pytest.mark.heavy,
-        ),
+        ("so101_mujocu", "", "adapter", "did you mean so101_mujoco"),
+        ("lerobot", "", "adapter", "unknown adapter"),
+        ("so101_kinematic", "transport: {port: /dev/ttyACM0}", "transport.port", "no transport"),
+        ("so101_kinematic", "params: {start_pose: {}}",
+         "params.start_pose", "did you mean start_pose_rad"),
+        ("so101_kinematic", "params: {start_pose_rad: {elbow: 0.1}}",
+         "params.start_pose_rad.elbow", "elbow_flex"),
+        ("so101_kinematic", "params: {start_pose_rad: {gripper: .nan}}",
+         "params.start_pose_rad.gripper", "finite"),
+        ("so101_kinematic", "params: {start_pose_rad: {gripper: 3.0}}",
+         "params.start_pose_rad.gripper", "outside"),
+        ("lerobot:so101_follower", "params: {joints: {gripper: {unit: furlongs}}}",
+         "params.joints.gripper.unit", "deg"),
+        ("lerobot:so101_follower", "params: {joints: {gripper: {lower_rad: 1, upper_rad: 0}}}",
+         "params.joints.gripper", "lower_rad must be below"),
+        ("lerobot:so101_follower", "params: {joints: {gripper: {sing: 1}}}",
+         "params.joints.gripper.sing", "sign"),
+        ("lerobot:so101_follower", "params: {estop: pray}", "params.estop", "hold"),
+        ("mujoco", f"params: {{{JOINT}}}", "params.model", "give the robot's MJCF"),
+        ("mujoco", f"params: {{{JOINT}, model: pandas}}", "params.model", "no such file: pandas"),
+        pytest.param("mujoco", f"params: {{joints: {{elbow: {{max_speed_rad_s: 1}}}}, {PANDA}}}",
+                     "params.model", "has no joint elbow", marks=HEAVY),
+        pytest.param("mujoco", f"params: {{{JOINT[:-2]}, lower_rad: 3}}}}, {PANDA}}}",
+                     "params.joints.panda_joint1", "is empty", marks=HEAVY),
+        pytest.param("mujoco", f"params: {{{JOINT}, {PANDA}, ends: {{a: {{frame: panda_hend}}}}}}",
+                     "params.ends.a.frame", "panda_hand", marks=HEAVY),
     ],
-)
-def test_each_mistake_names_its_field(adapter: str, sections: Any, field: str, said: str) -> None:
-    ((found, problem),) = fields(adapter, **sections)
+)  # fmt: skip
+def test_each_mistake_names_its_field(adapter: str, section: str, field: str, said: str) -> None:
+    ((found, problem),) = fields(adapter, **(yaml.safe_load(section) or {}))
     assert found == field
     assert said in problem
 

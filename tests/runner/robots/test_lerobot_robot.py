@@ -150,23 +150,14 @@ def test_a_model_gives_it_frames_and_the_file_its_policies_units(
         ({}, {"joints": {"motor_9": RANGE}}, "params.joints.motor_9", "no such joint"),
         ({}, {"joints": {}}, "params.joints.motor_1", "lower_rad, upper_rad, max_speed_rad_s"),
         ({"bus": False}, {"joints": JOINTS}, "params.joints.motor_1", "unit"),
-        (
-            {"bus": False},
-            {
-                "joints": {name: {**joint, "unit": "deg"} for name, joint in JOINTS.items()},
-                "estop": "torque_off",
-            },
-            "params.estop",
-            "use hold",
-        ),
-        (
-            {},
-            {"joints": JOINTS, "rest_pose_rad": {"elbow": 0}},
-            "params.rest_pose_rad.elbow",
-            "no such",
-        ),
+        ({"bus": False},
+         {"joints": {name: {**joint, "unit": "deg"} for name, joint in JOINTS.items()},
+          "estop": "torque_off"},
+         "params.estop", "use hold"),
+        ({}, {"joints": JOINTS, "rest_pose_rad": {"elbow": 0}}, "params.rest_pose_rad.elbow",
+         "no such"),
     ],
-)
+)  # fmt: skip
 def test_each_mistake_names_its_field(
     make_robot: Make, transport: Any, params: Any, field: str, said: str
 ) -> None:

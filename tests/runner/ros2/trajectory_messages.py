@@ -1,5 +1,5 @@
-"""Messages of `FollowJointTrajectory` as another ROS 2 implementation has them: types of Cyclone DDS
-alone, fields of control_msgs as of ROS 2 Jazzy."""
+"""Messages of `FollowJointTrajectory` as another ROS 2 implementation has them: types of Cyclone
+DDS alone, fields of control_msgs as of ROS 2 Jazzy."""
 
 from cyclonedds.idl.types import float64, int32, sequence, uint16, uint32
 

@@ -10,7 +10,7 @@ import pytest
 
 from tests.runner.manual_clock import ManualClock
 from tests.runner.small_robots import FedCamera, Twin, twin_runner
-from tests.support.serving import serving
+from tests.support.serving import answering
 from vram_arbiter.clients.net.server import RouterServer
 from vram_arbiter.clients.sidecar.perception import DetectorClient
 from vram_arbiter.runner.robots.hardware import HardwareRunner
@@ -76,7 +76,7 @@ async def client(short_folder: Path, model: Any) -> AsyncIterator[DetectorClient
     endpoint = f"ipc://{short_folder}/d.sock"
     server = RouterServer(endpoint, unread_reply(model.model_ops))
     async with (
-        serving(server, Wire(model, server.send).handle),
+        answering(server, Wire(model, server.send).handle),
         DetectorClient(endpoint) as client,
     ):
         yield client

@@ -366,28 +366,20 @@ def test_stop_wakes_waiters_ends_the_thread_and_start_begins_anew(
 @pytest.mark.parametrize(
     ("params", "problem"),
     [
-        (
-            {"pipeline": "videotestsrc ! nosuchthing"},
-            'backend_params.pipeline: no element "nosuchthing"',
-        ),
+        ({"pipeline": "videotestsrc ! nosuchthing"},
+         'backend_params.pipeline: no element "nosuchthing"'),
         ({"pipeline": "videotestsrc patern=ball"}, 'no property "patern"'),
         ({"pipeline": "videotestsrc ! appsink name=mine"}, "has no appsink named sink"),
         ({"pipeline": "appsink name=sink"}, "has no appsink named sink"),
         ({"source": "test", "pattern": "plaid"}, "pattern"),
-        (
-            {"source": "test", "patern": "ball"},
-            "backend_params.patern: unknown key; did you mean pattern?",
-        ),
-        (
-            {"source": "file", "path": "/no/such.mp4"},
-            "backend_params.path: there is no file /no/such.mp4",
-        ),
-        (
-            {"source": "v4l2", "device": "/dev/video0", "codec": "h264", "platform": "tegra"},
-            "or say platform: cpu_only to decode on the CPU",
-        ),
+        ({"source": "test", "patern": "ball"},
+         "backend_params.patern: unknown key; did you mean pattern?"),
+        ({"source": "file", "path": "/no/such.mp4"},
+         "backend_params.path: there is no file /no/such.mp4"),
+        ({"source": "v4l2", "device": "/dev/video0", "codec": "h264", "platform": "tegra"},
+         "or say platform: cpu_only to decode on the CPU"),
     ],
-)
+)  # fmt: skip
 def test_mistakes_are_named(params: dict[str, Any], problem: str) -> None:
     with pytest.raises(ConfigError) as caught:
         make(wrist(**params), CLOCK, None)

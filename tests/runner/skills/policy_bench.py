@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 from tests.runner.small_robots import robot_of
-from tests.support.serving import serving
+from tests.support.serving import answering
 from vram_arbiter.clients.lease import AsyncLease
 from vram_arbiter.clients.net.server import Peer, RouterServer
 from vram_arbiter.clients.sidecar import npy
@@ -75,7 +75,7 @@ class Sidecar:
     @asynccontextmanager
     async def served(self, endpoint: str) -> AsyncIterator[None]:
         self.server = RouterServer(endpoint, lambda error: {"ok": False, "error": str(error)})
-        async with serving(self.server, self.handle):
+        async with answering(self.server, self.handle):
             yield
 
     async def handle(self, peer: Peer, message: Message) -> None:

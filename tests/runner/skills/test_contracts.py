@@ -289,36 +289,22 @@ def test_joint_steps_and_speeds_start_at_the_last_target(
 
 
 @pytest.mark.parametrize(
-    ("gripper", "value", "wanted"),
+    ("kind", "mode", "convention", "value", "wanted"),
     [
-        (
-            "gripper_position, control_mode_semantics: {mode: absolute, gripper_convention:"
-            " normalized_open_unit}",
-            0.75,
-            0.75,
-        ),
-        (
-            "gripper_position, control_mode_semantics: {mode: delta, gripper_convention:"
-            " normalized_open_unit}",
-            0.25,
-            0.75,
-        ),
-        (
-            "gripper_binary, control_mode_semantics: {mode: absolute, gripper_convention:"
-            " normalized_open_symmetric}",
-            0.1,
-            1.0,
-        ),
+        ("gripper_position", "absolute", "normalized_open_unit", 0.75, 0.75),
+        ("gripper_position", "delta", "normalized_open_unit", 0.25, 0.75),
+        ("gripper_binary", "absolute", "normalized_open_symmetric", 0.1, 1.0),
     ],
 )
 def test_a_gripper_among_joint_steps_goes_as_its_own_actuator_says(
-    gripper: str, value: float, wanted: float
+    kind: str, mode: str, convention: str, value: float, wanted: float
 ) -> None:
     """Six joints in one vector: five deltas, and a gripper told where to be, or switched."""
     robot = so101(simulated=True)
     manifest = skill(
         "actuators_required:\n  - {kind: joint_position, control_mode_semantics: {mode: delta}}\n"
-        f"  - {{kind: {gripper}}}\naction_contract: {{dim: 6}}\n"
+        f"  - {{kind: {kind}, control_mode_semantics:"
+        f" {{mode: {mode}, gripper_convention: {convention}}}}}\naction_contract: {{dim: 6}}\n"
     )
     wiring = wire_up(manifest, robot, None)
     lower, span = -0.17453, 1.74533 + 0.17453

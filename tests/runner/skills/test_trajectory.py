@@ -146,23 +146,17 @@ def test_it_is_refused_or_played_within_the_limits(
         (trajectory((0.1,), names=("elbow",)), "unknown joint elbow; the robot has shoulder_pan"),
         (trajectory((0.1, 0.2)), r"points\[0\]: 2 positions for 1 joints"),
         (trajectory((2.0,)), r"points\[0\]: elbow_flex 2 rad is outside"),
-        (
-            trajectory((0.0,), (1.5,), every_s=0.1),
-            r"points\[1\]: elbow_flex would have to make 15.00 rad/s; at most 4.70",
-        ),
+        (trajectory((0.0,), (1.5,), every_s=0.1),
+         r"points\[1\]: elbow_flex would have to make 15.00 rad/s; at most 4.70"),
         (trajectory((0.1,), (0.2,), every_s=0.0), "time_from_start must be above 0"),
         (trajectory((math.nan,)), "finite number"),
-        (
-            trajectory((0.1,), path_tolerance=[{"name": "elbow", "position": 0.1}]),
-            "unknown joint elbow",
-        ),
-        (
-            trajectory((0.1,), goal_tolerance=[{"name": "elbow", "position": 0.1}]),
-            "unknown joint elbow",
-        ),
+        (trajectory((0.1,), path_tolerance=[{"name": "elbow", "position": 0.1}]),
+         "unknown joint elbow"),
+        (trajectory((0.1,), goal_tolerance=[{"name": "elbow", "position": 0.1}]),
+         "unknown joint elbow"),
         (trajectory((0.1,)) | {"speed": 3}, "speed"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_done_is_refused_before_anything_moves(
     params: dict[str, Any], said: str
 ) -> None:

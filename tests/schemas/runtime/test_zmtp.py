@@ -108,19 +108,15 @@ def test_the_greeting_goes_out_first_and_ready_only_to_a_zmtp_peer() -> None:
         (PEER_GREETING + ready(), "neither a DEALER nor a REQ"),
         (PEER_GREETING + ready((b"Socket-Type", b"PUB")), "neither a DEALER nor a REQ"),
         (PEER_GREETING + command_frame(b"READY", b"\x00"), "malformed property"),
-        (
-            PEER_GREETING + command_frame(b"READY", b"\x0bSocket-Type\x00\x00\xff\xffDEALER"),
-            "malformed property",
-        ),
+        (PEER_GREETING + command_frame(b"READY", b"\x0bSocket-Type\x00\x00\xff\xffDEALER"),
+         "malformed property"),
         (PEER_GREETING + command_frame(b"READY", b"\x0bSocket"), "malformed property"),
         (PEER_GREETING + b"\x04\x00", "without a name"),
         (PEER_GREETING + b"\x04\x01\x05", "without a name"),
         (PEER_GREETING + b"\x06" + (COMMAND_MAX_BYTES + 1).to_bytes(8), "a command of"),
         (PEER_GREETING + DEALER_READY + DEALER_READY, "unexpected command 'READY'"),
-        (
-            PEER_GREETING + DEALER_READY + command_frame(b"SUBSCRIBE"),
-            "unexpected command 'SUBSCRIBE'",
-        ),
+        (PEER_GREETING + DEALER_READY + command_frame(b"SUBSCRIBE"),
+         "unexpected command 'SUBSCRIBE'"),
         (PEER_GREETING + DEALER_READY + command_frame(b"\x1b[2J"), r"'\\x1b\[2J'"),
         (PEER_GREETING + DEALER_READY + command_frame(b"PING"), "a PING of 0 bytes"),
         (PEER_GREETING + DEALER_READY + command_frame(b"PING", bytes(19)), "a PING of 19 bytes"),
@@ -128,18 +124,10 @@ def test_the_greeting_goes_out_first_and_ready_only_to_a_zmtp_peer() -> None:
         (PEER_GREETING + DEALER_READY + b"\x05\x00", "flags 0x05"),
         (PEER_GREETING + DEALER_READY + b"\x01\x00" * (FRAMES_MAX + 1), "more than 8 frames"),
         (PEER_GREETING + DEALER_READY + b"\x02" + b"\xff" * 8, "at most 4000 are read"),
-        (
-            PEER_GREETING
-            + DEALER_READY
-            + b"\x03"
-            + (2001).to_bytes(8)
-            + bytes(2001)
-            + b"\x03"
-            + (2000).to_bytes(8),
-            "at most 4000",
-        ),
+        (PEER_GREETING + DEALER_READY + b"\x03" + (2001).to_bytes(8) + bytes(2001)
+         + b"\x03" + (2000).to_bytes(8), "at most 4000"),
     ],
-)
+)  # fmt: skip
 def test_what_breaks_the_protocol_is_refused(data: bytes, reason: str) -> None:
     connection = ServerConnection(LIMITS)
     with pytest.raises(ZmtpError, match=reason):

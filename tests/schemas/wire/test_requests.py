@@ -30,14 +30,10 @@ PLAIN_SPEC = {
 }
 HELD = {**REF, "spec": PLAIN_SPEC, "state": "held", "measured_bytes": None, "use_ids": ["u"]}
 RECORDED: list[tuple[w.AnyRequest, dict[str, Any]]] = [
-    (
-        w.Hello(name="n", instance="1-a"),
-        {"op": "hello", "version": 3, "name": "n", "instance": "1-a", "role": "client"},
-    ),
-    (
-        w.Acquire("n1", SPEC, 4.0),
-        {"op": "acquire", "nonce": "n1", "spec": PLAIN_SPEC, "wait_timeout_s": 4.0},
-    ),
+    (w.Hello(name="n", instance="1-a"),
+     {"op": "hello", "version": 3, "name": "n", "instance": "1-a", "role": "client"}),
+    (w.Acquire("n1", SPEC, 4.0),
+     {"op": "acquire", "nonce": "n1", "spec": PLAIN_SPEC, "wait_timeout_s": 4.0}),
     (w.Ready(*ON), {"op": "ready", **REF, "measured_bytes": None}),
     (
         w.UseBegin(*ON, UseId("u")),
@@ -50,10 +46,8 @@ RECORDED: list[tuple[w.AnyRequest, dict[str, Any]]] = [
     (w.Release(*ON), {"op": "release", **REF, "exiting": False, "parked": False}),
     (w.Cancel(ON[0]), {"op": "cancel", "lease_id": "L1-1"}),
     (w.Reacquire(*ON), {"op": "reacquire", **REF, "wait_timeout_s": None}),
-    (
-        w.Reattach((w.ReattachLease(*ON, SPEC, "held", None, (UseId("u"),)),)),
-        {"op": "reattach", "leases": [HELD]},
-    ),
+    (w.Reattach((w.ReattachLease(*ON, SPEC, "held", None, (UseId("u"),)),)),
+     {"op": "reattach", "leases": [HELD]}),
     (w.Oom(*ON, 5), {"op": "oom", **REF, "requested_bytes": 5, "allocated_bytes": None}),
     (w.Status(), {"op": "status"}),
     (w.Status(True, after=(0, 1.5, 7)), {"op": "status", "details": True, "after": [0, 1.5, 7]}),
@@ -68,13 +62,11 @@ RECORDED: list[tuple[w.AnyRequest, dict[str, Any]]] = [
     (w.Drain("r"), {"op": "drain", "reason": "r"}),
     (w.Resume("r"), {"op": "resume", "reason": "r"}),
     (w.Prepare("c"), {"op": "prepare", "consumer": "c"}),
-    (
-        w.Demand((w.ConsumerDemand("c", 1, 2),)),
-        {"op": "demand", "consumers": [{"consumer": "c", "in_flight": 1, "waiting": 2}]},
-    ),
+    (w.Demand((w.ConsumerDemand("c", 1, 2),)),
+     {"op": "demand", "consumers": [{"consumer": "c", "in_flight": 1, "waiting": 2}]}),
     (w.Ping(), {"op": "ping"}),
     (w.Bye(), {"op": "bye"}),
-]
+]  # fmt: skip
 
 
 def test_a_request_is_sent_and_read_as_ever() -> None:

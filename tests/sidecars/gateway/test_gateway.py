@@ -21,7 +21,7 @@ from tests.support.collector import Collector
 from tests.support.leases import view_of
 from tests.support.prepared import start
 from tests.support.process import ArbiterProcess
-from tests.support.processes import alive, rss_bytes
+from tests.support.processes import rss_bytes
 from tests.support.waiting import PATIENCE_S, eventually
 from vram_arbiter.clients.sync import Client
 from vram_arbiter.reasoner.llm.config import LlmConfig
@@ -285,17 +285,6 @@ async def test_what_can_never_fit_is_said_in_the_arbiters_words(
     async with openai_client(started) as client:
         with pytest.raises(openai.InternalServerError, match="500 GiB"):
             await ask(client, "b")
-
-
-async def test_a_killed_gateway_leaves_nothing_behind(
-    gateway: Start, arbiter_daemon: ArbiterProcess
-) -> None:
-    started = gateway({"a": stand_in(arbiter_daemon, 1)})
-    pid = await asyncio.to_thread(started.pid_of, "a")
-    started.process.kill()
-    await eventually(lambda: not alive(pid))
-    with Client("t", endpoint=arbiter_daemon.endpoint) as arbiter:
-        await eventually(lambda: not arbiter.status().leases)
 
 
 @pytest.mark.nightly

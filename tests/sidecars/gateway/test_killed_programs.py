@@ -18,7 +18,8 @@ from tests.support.processes import alive
 from tests.support.waiting import PATIENCE_S, eventually
 from vram_arbiter.clients.sync import Client
 
-pytestmark = [pytest.mark.anyio, pytest.mark.e2e, pytest.mark.nightly]
+pytestmark = [pytest.mark.anyio, pytest.mark.e2e]
+AT_NIGHT = pytest.mark.nightly
 Start = Callable[..., GatewayProcess]
 
 
@@ -48,6 +49,7 @@ async def status(gateway: GatewayProcess, model: str) -> int:
         return answer.status
 
 
+@AT_NIGHT
 async def test_a_server_killed_in_a_stream_breaks_it_and_is_started_again(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:
@@ -65,6 +67,7 @@ async def test_a_server_killed_in_a_stream_breaks_it_and_is_started_again(
     assert await status(started, "a") == 200
 
 
+@AT_NIGHT
 async def test_a_server_killed_as_it_starts_fails_its_requests_alone(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:
@@ -77,7 +80,10 @@ async def test_a_server_killed_as_it_starts_fails_its_requests_alone(
     assert await status(started, "b") == 200
 
 
-@pytest.mark.parametrize("when", ["queued", "ready", "leaving"])
+@pytest.mark.parametrize(
+    "when",
+    ["ready", pytest.param("queued", marks=AT_NIGHT), pytest.param("leaving", marks=AT_NIGHT)],
+)
 async def test_a_gateway_killed_in_any_state_leaves_no_server_and_no_lease(
     gateway: Start, arbiter_daemon: ArbiterProcess, when: str
 ) -> None:
@@ -103,6 +109,7 @@ async def test_a_gateway_killed_in_any_state_leaves_no_server_and_no_lease(
         await eventually(lambda: not arbiter.status().leases)
 
 
+@AT_NIGHT
 async def test_a_killed_arbiter_ends_no_stream(
     gateway: Start, arbiter_daemon: ArbiterProcess
 ) -> None:

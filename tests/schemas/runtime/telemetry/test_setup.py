@@ -81,27 +81,15 @@ OTLP_AND_PROMETHEUS = {
         ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE + "/"}, OTLP, OTLP, OTLP),
         ({"OTEL_LOGS_EXPORTER": "console"}, (), (), ("console",)),
         ({"OTEL_EXPORTER_OTLP_TRACES_ENDPOINT": BASE + "/own"}, OTLP, (), ()),
-        (
-            {
-                "OTEL_EXPORTER_OTLP_ENDPOINT": BASE,
-                "OTEL_METRICS_EXPORTER": "none",
-                "OTEL_LOGS_EXPORTER": "none",
-            },
-            OTLP,
-            (),
-            (),
-        ),
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_METRICS_EXPORTER": "none",
+          "OTEL_LOGS_EXPORTER": "none"}, OTLP, (), ()),
         ({"OTEL_TRACES_EXPORTER": "otlp, console"}, ("otlp", "console"), (), ()),
         ({"OTEL_METRICS_EXPORTER": "prometheus"}, (), ("prometheus",), ()),
-        (
-            {"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_METRICS_EXPORTER": "otlp,prometheus"},
-            OTLP,
-            ("otlp", "prometheus"),
-            OTLP,
-        ),
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_METRICS_EXPORTER": "otlp,prometheus"}, OTLP,
+         ("otlp", "prometheus"), OTLP),
         ({"OTEL_EXPORTER_OTLP_ENDPOINT": BASE, "OTEL_SDK_DISABLED": "True"}, (), (), ()),
     ],
-)
+)  # fmt: skip
 def test_the_environment_says_which_exporters_are_wanted(
     environ: Mapping[str, str], traces: Sequence[str], metrics: Sequence[str], logs: Sequence[str]
 ) -> None:
@@ -114,30 +102,19 @@ def test_the_environment_says_which_exporters_are_wanted(
     [
         ({"OTEL_TRACES_EXPORTER": "zipkin"}, "no exporter 'zipkin' is installed"),
         ({"OTEL_METRICS_EXPORTER": "statsd"}, "no exporter 'statsd' is installed"),
-        (
-            {"OTEL_TRACES_EXPORTER": "otlp", "OTEL_EXPORTER_OTLP_PROTOCOL": "grpc"},
-            "no exporter 'otlp_proto_grpc' is installed",
-        ),
-        (
-            {"OTEL_TRACES_EXPORTER": "otlp", "OTEL_EXPORTER_OTLP_PROTOCOL": "carrier-pigeon"},
-            "expected http/protobuf or grpc, got 'carrier-pigeon'",
-        ),
-        (
-            {"OTEL_METRICS_EXPORTER": "otlp", "OTEL_EXPORTER_OTLP_METRICS_PROTOCOL": "http/json"},
-            "expected http/protobuf or grpc, got 'http/json'",  # protobuf was sent instead
-        ),
-        (
-            {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_HOST": "0.0.0.0"},
-            "expected a loopback address",
-        ),
-        (
-            {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_HOST": "robot"},
-            "expected ADDRESS:PORT",
-        ),
-        (
-            {"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_PORT": "70000"},
-            "expected ADDRESS:PORT",
-        ),
+        ({"OTEL_TRACES_EXPORTER": "otlp", "OTEL_EXPORTER_OTLP_PROTOCOL": "grpc"},
+         "no exporter 'otlp_proto_grpc' is installed"),
+        ({"OTEL_TRACES_EXPORTER": "otlp", "OTEL_EXPORTER_OTLP_PROTOCOL": "carrier-pigeon"},
+         "expected http/protobuf or grpc, got 'carrier-pigeon'"),
+        # protobuf was sent instead
+        ({"OTEL_METRICS_EXPORTER": "otlp", "OTEL_EXPORTER_OTLP_METRICS_PROTOCOL": "http/json"},
+         "expected http/protobuf or grpc, got 'http/json'"),
+        ({"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_HOST": "0.0.0.0"},
+         "expected a loopback address"),
+        ({"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_HOST": "robot"},
+         "expected ADDRESS:PORT"),
+        ({"OTEL_METRICS_EXPORTER": "prometheus", "OTEL_EXPORTER_PROMETHEUS_PORT": "70000"},
+         "expected ADDRESS:PORT"),
         # more than the queue holds
         ({"OTEL_BSP_MAX_EXPORT_BATCH_SIZE": "4096"}, "OpenTelemetry cannot be set up: "),
         ({"OTEL_BSP_SCHEDULE_DELAY": "0"}, "OpenTelemetry cannot be set up: "),
@@ -145,7 +122,7 @@ def test_the_environment_says_which_exporters_are_wanted(
         ({"OTEL_METRICS_EXEMPLAR_FILTER": "sometimes"}, "OpenTelemetry cannot be set up: "),
         ({"OTEL_SPAN_ATTRIBUTE_COUNT_LIMIT": "many"}, "OpenTelemetry cannot be set up: "),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_set_up_is_the_operators_error_and_leaves_no_half(
     environ: dict[str, str], words: str, variables: Variables
 ) -> None:
