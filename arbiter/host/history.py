@@ -63,6 +63,11 @@ SELECT seq, at_wall_s, json FROM events
     WHERE seq > ? AND (? = '[]' OR kind IN (SELECT value FROM json_each(?)))
     ORDER BY seq LIMIT ?
 """
+_NEWEST = """
+SELECT seq, at_wall_s, json FROM events
+    WHERE seq > ? AND seq < ? AND (? = '[]' OR kind IN (SELECT value FROM json_each(?)))
+    ORDER BY seq DESC LIMIT ?
+"""
 
 
 class History:
@@ -138,29 +143,44 @@ class History:
                 self._disk.flush()
         return event
 
-    def read(self, after: int, limit: int, kinds: tuple[str, ...], done: Done) -> None:
-        """Find the events after a number, oldest first.
+    def read(
+        self,
+        after: int,
+        limit: int,
+        kinds: tuple[str, ...],
+        done: Done,
+        before: int | None = None,
+    ) -> None:
+        """Find the events after a number, oldest first; with `before`, the newest ones below it.
 
         Calls `done({"events", "last_seq"})` at once, or later on the loop's thread.
         """
         first = self._ring[0]["seq"] if self._ring else self._last_seq + 1
+        wanted = frozenset(kinds)
+        held = [
+            e
+            for e in self._ring
+            if after < e["seq"]
+            and (before is None or e["seq"] < before)
+            and (not wanted or e["kind"] in wanted)
+        ]
+        held = held[:limit] if before is None else held[-limit:]
         store, disk = self._store, self._disk
-        if store is None or disk is None or not disk.running or after + 1 >= first:
-            wanted = frozenset(kinds)
-            found = [
-                e for e in self._ring if e["seq"] > after and (not wanted or e["kind"] in wanted)
-            ]
-            done(self._reply(found[:limit]))
+        enough = after + 1 >= first or (before is not None and len(held) == limit)
+        if store is None or disk is None or not disk.running or enough:
+            done(self._reply(held))
             return
+
+        held, end = ([], None) if before is None else (held, min(before, first))
 
         def answer(found: list[Event] | DiskFailed) -> None:
             if isinstance(found, DiskFailed):
                 done(self._reply((), str(found)))
             else:
-                done(self._reply(found))
+                done(self._reply([*found, *held]))
 
         try:
-            disk.ask(lambda: store.find(after, limit, kinds), answer)
+            disk.ask(lambda: store.find(after, limit - len(held), kinds, end), answer)
         except DiskBehind:
             done(self._reply((), "the disk of the history does not answer"))
 
@@ -306,9 +326,16 @@ class _Store:
             "DELETE FROM events WHERE at_wall_s < ? AND seq <= ?", (wall_s - age_s, up_to)
         )
 
-    def find(self, after: int, limit: int, kinds: tuple[str, ...]) -> list[Event]:
+    def find(
+        self, after: int, limit: int, kinds: tuple[str, ...], before: int | None = None
+    ) -> list[Event]:
         wanted = json.dumps(list(kinds))
-        return [_event(*row) for row in self._db.execute(_QUESTION, (after, wanted, wanted, limit))]
+        if before is None:
+            rows = self._db.execute(_QUESTION, (after, wanted, wanted, limit)).fetchall()
+        else:
+            rows = self._db.execute(_NEWEST, (after, before, wanted, wanted, limit)).fetchall()
+            rows.reverse()
+        return [_event(*row) for row in rows]
 
     def close(self) -> None:
         self._db.close()

@@ -54,13 +54,16 @@ from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import DaemonView, DemandView, SensorsView
 
 HISTORY_PAGE = 2000
+SEQ_END = (1 << 63) - 1  # SQLite knows no greater number
 """Events in one reply, whatever was asked for: packing more would hold the loop for too long."""
 _HOLDING = (w.Acquire, w.Reacquire, w.Reattach, w.UseBegin)
 """Requests that can make the engine remember something of a client beyond its connection."""
 _KINDS = frozenset((*NOTES, *DAEMON_KINDS))
 
 
-HistoryReader = Callable[[int, int, tuple[str, ...], Callable[[HistoryReply], None]], None]
+HistoryReader = Callable[
+    [int, int, tuple[str, ...], Callable[[HistoryReply], None], int | None], None
+]
 """`read(after, limit, kinds, done)`: `done` is called on the loop's thread, at once or later, with
 the body of the reply."""
 
@@ -233,10 +236,11 @@ class SessionTable:
                 decisions.when_read(lambda: self.reply(client, re, decisions.why(consumer)))
             case w.History():
                 _check_kinds(request.kinds)
-                after = max(0, min(request.after, (1 << 63) - 1))
+                after = max(0, min(request.after, SEQ_END))
+                before = None if request.before is None else min(request.before, SEQ_END)
                 limit = min(request.limit, HISTORY_PAGE)
                 self._history(
-                    after, limit, request.kinds, lambda body: self.reply(client, re, body)
+                    after, limit, request.kinds, lambda body: self.reply(client, re, body), before
                 )
             case w.Subscribe():
                 self._subscribe(session)

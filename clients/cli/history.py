@@ -23,7 +23,6 @@ from vram_arbiter.schemas.wire.requests import History
 
 LIMIT = 50
 PAGE = 2000  # events in one reply; more would not fit a message
-GAP_MAX = 4000  # numbers that the daemon may leave out after a crash
 NEVER = 1 << 62  # no event has a number beyond it
 
 DESCRIPTIONS = {
@@ -136,11 +135,15 @@ class Wanted:
             return False
         return event["kind"] not in text.QUIET_KINDS.intersection(self.kinds)
 
+    def too_old(self, event: JsonMap) -> bool:
+        """Return whether an event is of a time that is not wanted any more."""
+        return self.since_wall_s is not None and event["at_wall_s"] < self.since_wall_s
+
     def fits(self, event: JsonMap) -> bool:
         return (
             (not self.kinds or event["kind"] in self.kinds)
             and (not self.consumers or any(about(event, name) for name in self.consumers))
-            and (self.since_wall_s is None or event["at_wall_s"] >= self.since_wall_s)
+            and not self.too_old(event)
         )
 
 
@@ -173,70 +176,30 @@ def history(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = Non
 
 
 def collect(wanted: Wanted, endpoint: str | None) -> Message:
-    """Page forward: to the end, keeping the tail, or (`after`) until there are enough. Raises
-    ArbiterUnreachable."""
-    reply = page(NEVER, 1, (), endpoint)
-    if not reply.get("ok"):
-        return reply
-    last_seq = int(reply.get("last_seq", 0))
-    if wanted.after is not None:
-        return _forward(wanted, wanted.after, endpoint)
-    after = _start(wanted, last_seq, endpoint)
-    while True:
-        reply = _forward(wanted, after, endpoint)
-        short = len(reply.get("events", ())) < wanted.limit
-        if not short or after == 0 or wanted.since_wall_s is not None or not reply.get("ok"):
-            return reply
-        after = max(
-            0, last_seq - 8 * (last_seq - after)
-        )  # more numbers were left out than there are in one gap
-
-
-def _forward(wanted: Wanted, after: int, endpoint: str | None) -> Message:
+    """Page back from the newest until there are enough, keeping the tail; with `after`, to that
+    number, keeping the head. Raises ArbiterUnreachable."""
     found: list[Any] = []
     folded: list[int] = []  # numbers of quiet events
-    while (reply := page(after, PAGE, wanted.kinds, endpoint)).get("ok"):
+    before = NEVER
+    while (reply := page(wanted, before, endpoint)).get("ok"):
         events = reply.get("events", [])
         fitting = [event for event in events if wanted.fits(event)]
-        found += [event for event in fitting if not wanted.folds(event)]
+        found[:0] = [event for event in fitting if not wanted.folds(event)]
         folded += [event["seq"] for event in fitting if wanted.folds(event)]
-        if wanted.after is None:
-            found = found[-wanted.limit :]
-        if len(events) < PAGE or (wanted.after is not None and len(found) >= wanted.limit):
-            shown = found[: wanted.limit]
+        enough = wanted.after is None and len(found) >= wanted.limit
+        if enough or len(events) < PAGE or wanted.too_old(events[0]):
+            shown = found[-wanted.limit :] if wanted.after is None else found[: wanted.limit]
             first = shown[0]["seq"] if shown else 0
             told = {} if wanted.quiet else {"folded": sum(seq > first for seq in folded)}
             return {**reply, "events": shown, **told}
-        after = events[-1]["seq"]
+        before = events[0]["seq"]
     return reply
 
 
-def page(after: int, limit: int, kinds: Sequence[str], endpoint: str | None) -> Message:
-    """Ask for the events after a number. Raises ArbiterUnreachable."""
-    return request.ask(History(after, limit, tuple(kinds)), endpoint)
-
-
-def _start(wanted: Wanted, last_seq: int, endpoint: str | None) -> int:
-    """A number before the first event that can be wanted."""
-    if wanted.since_wall_s is not None:
-        return first_since(wanted.since_wall_s, last_seq, endpoint)
-    if wanted.kinds or wanted.consumers:
-        return 0
-    # numbers have gaps: the start of the tail cannot be computed
-    return max(0, last_seq - wanted.limit - GAP_MAX)
-
-
-def first_since(wall_s: float, last_seq: int, endpoint: str | None) -> int:
-    """By halves: a number not later than the first event since that time."""
-    low, high = 0, last_seq
-    while high - low > PAGE:
-        middle = (low + high) // 2
-        events = page(middle, 1, (), endpoint).get("events", [])
-        if events and events[0]["at_wall_s"] < wall_s:
-            low = middle
-        else:
-            high = middle
-    return low
+def page(wanted: Wanted, before: int, endpoint: str | None) -> Message:
+    """Ask for the newest events below a number. Raises ArbiterUnreachable."""
+    asked = History(wanted.after or 0, PAGE, tuple(wanted.kinds), before)
+    return request.ask(asked, endpoint)
 
 
 async def follow(wanted: Wanted, *, as_json: bool = False, endpoint: str | None = None) -> int:

@@ -30,7 +30,6 @@ from vram_arbiter.runner.sensors.pictures import FramePicture
 from vram_arbiter.runner.sensors.synced import FrameSet, SyncedCameras
 from vram_arbiter.runner.sensors.world_state import JOINT_STATE, WorldStateAggregator
 from vram_arbiter.schemas.config.robot import SyncConfig
-from vram_arbiter.schemas.control import ControlMode
 from vram_arbiter.schemas.errors import (
     BadRequest,
     Cancelled,
@@ -97,7 +96,6 @@ class HardwareRobot:
         self._first_data_s = first_data_s
         self._halted = False
         self._stale_since_s: float | None = None
-        self._sent: dict[str, float] = {}  # newest target of each joint, rad
 
     # -- life
     def open(self, stopping: threading.Event) -> None:
@@ -295,7 +293,6 @@ class HardwareRobot:
         labels: dict[str, str] = {}
         try:
             self.hal.send_action(action)
-            self._remember(action)
         except EstopRequested as error:
             labels[telemetry.ATTR_ERROR_TYPE] = error.code
             self._stopped_by_hardware(error)
@@ -309,14 +306,9 @@ class HardwareRobot:
             meters.measure(telemetry.METRIC_HAL_SEND, self._clock.now_s() - began_s, labels)
         return Applied()
 
-    def _remember(self, action: Action) -> None:
-        if action.control_mode is ControlMode.JOINT_POSITION:
-            names = action.joint_names or self.hal.description.joint_names
-            self._sent.update(zip(names, action.rows[0], strict=True))
-
     # -- for recordings and reports
     def targets(self) -> Mapping[str, float]:
-        return self._sent
+        return self.hal.sent()
 
     def facts(self) -> GoalData:
         if not self.detections:

@@ -219,11 +219,14 @@ class AskWhy(Question[WhyReply], op="why"):
 
 
 class History(Question[r.HistoryReply], op="history"):
-    """Events after a number, oldest first; a reply has at most 2000."""
+    """Events after a number, oldest first; a reply has at most 2000. With `before`: the newest ones
+    with a smaller number than that."""
 
+    WHOLE: ClassVar = False  # an older arbiter knows no `before`
     after: int = 0  # sequence number of the last event already seen
     limit: Annotated[int, Limits(ge=1, le=5000)] = 500
     kinds: Annotated[tuple[str, ...], Limits(max_length=d.LISTED_MAX, fail_fast=True)] = ()
+    before: Annotated[int, Limits(ge=1)] | None = None
 
 
 class Subscribe(Question[r.DoneReply], op="subscribe"):

@@ -139,7 +139,7 @@ class Twin(KinematicTwin):
         self.answers_lost = 0
         self.halts_lost = 0
         self.halt_breaks: Exception | None = None
-        self.sent: list[Action] = []
+        self.applied: list[Action] = []
         self.story: list[str] = []
 
     def _open(self) -> None:
@@ -169,7 +169,7 @@ class Twin(KinematicTwin):
         if self.deaf:
             raise RobotFault("motor 2 takes nothing", hint="look at the cable")
         super().send_action(action)
-        self.sent.append(action)
+        self.applied.append(action)
 
 
 def twin_runner(

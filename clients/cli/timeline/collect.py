@@ -8,12 +8,12 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from vram_arbiter.clients.cli import history
-from vram_arbiter.clients.cli.history import NEVER
+from vram_arbiter.clients.cli.history import NEVER, Wanted
 from vram_arbiter.clients.cli.offline import EVENT_LOG
 from vram_arbiter.clients.cli.status import all_pages
 from vram_arbiter.clients.cli.timeline.reader import Reader
@@ -66,12 +66,10 @@ def from_history(wanted: Range, endpoint: str | None) -> Story:
     """Read the history of a running daemon. Raises EmptyTimeline, ArbiterUnreachable, and what the
     arbiter refuses."""
     begin = wanted.begin_s(time.time(), 0.0)
-    last_seq = int(_readable(history.page(NEVER, 1, (), endpoint))["last_seq"])
-    start = history.first_since(begin, last_seq, endpoint)
-    events = [one for one in _events(start, NEVER, (), endpoint) if one["at_wall_s"] >= begin]
+    events = _events(Wanted(since_wall_s=begin, limit=NEVER), endpoint)
     status = from_map(StatusReply, checked(all_pages(endpoint)))
     end = time.time()
-    earlier = _earlier(events, status.leases, begin, last_seq, endpoint)
+    earlier = _earlier(events, status.leases, begin, endpoint)
     if not events and not status.leases:
         since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(begin))
         raise EmptyTimeline(
@@ -94,30 +92,22 @@ def _earlier(
     events: Sequence[JsonMap],
     leases: Sequence[LeaseView],
     begin_s: float,
-    last_seq: int,
     endpoint: str | None,
 ) -> list[JsonMap]:
     """Return events before the range that tell the size of leases whose grant is not in it."""
     begun = {one["lease_id"] for one in events if one["kind"] in ("queued", "granted")}
     told = {one["lease_id"] for one in events if one.get("lease_id")}
     unknown = (told | {lease.lease_id for lease in leases}) - begun
-    first = int(events[0]["seq"]) if events else last_seq + 1
-    if not unknown or first <= 1:
+    if not unknown:
         return []
-    found = _events(0, first, SIZES, endpoint)
+    found = _events(Wanted(SIZES, limit=NEVER), endpoint)
     return [one for one in found if one["lease_id"] in unknown and one["at_wall_s"] <= begin_s]
 
 
-def _events(
-    after: int, before: int, kinds: Sequence[str], endpoint: str | None
-) -> Iterator[JsonMap]:
-    """Yield the events with numbers between two."""
-    while True:
-        events = _readable(history.page(after, history.PAGE, kinds, endpoint))["events"]
-        yield from (event for event in events if event["seq"] < before)
-        if len(events) < history.PAGE or events[-1]["seq"] >= before:
-            return
-        after = events[-1]["seq"]
+def _events(wanted: Wanted, endpoint: str | None) -> Sequence[JsonMap]:
+    """Return all events that are wanted."""
+    found: Sequence[JsonMap] = _readable(history.collect(wanted, endpoint))["events"]
+    return found
 
 
 def _readable(reply: Message) -> Message:

@@ -42,10 +42,14 @@ def with_history(
 
 
 async def page(
-    history: History, after: int = 0, limit: int = 500, kinds: tuple[str, ...] = ()
+    history: History,
+    after: int = 0,
+    limit: int = 500,
+    kinds: tuple[str, ...] = (),
+    before: int | None = None,
 ) -> HistoryReply:
     answer: asyncio.Future[HistoryReply] = asyncio.get_running_loop().create_future()
-    history.read(after, limit, kinds, answer.set_result)
+    history.read(after, limit, kinds, answer.set_result, before)
     return await answer
 
 
@@ -130,6 +134,27 @@ def test_what_memory_no_longer_holds_is_found_on_disk(tmp_path: Path) -> None:
             3,
         ]
         assert len((await page(history, limit=5000)).events) == RING_EVENTS + 50
+
+    with_history(tmp_path, test)
+
+
+def test_the_newest_below_a_number_are_found_in_memory_and_on_disk(tmp_path: Path) -> None:
+    async def test(history: History) -> None:
+        for number in range(1, RING_EVENTS + 51):
+            history.append("odd" if number % 2 else "even", {})
+        end = RING_EVENTS + 51
+
+        async def numbers(before: int, limit: int, *kinds: str, after: int = 0) -> list[int]:
+            found = await page(history, after, limit, kinds, before)
+            return [event["seq"] for event in found.events]
+
+        assert await numbers(1 << 62, 2) == [end - 2, end - 1]
+        assert await numbers(end - 1, 2) == [end - 3, end - 2]
+        assert await numbers(53, 4) == [49, 50, 51, 52]  # memory begins with 51
+        assert await numbers(53, 3, "odd") == [47, 49, 51]
+        assert await numbers(53, 9, after=47) == [48, 49, 50, 51, 52]
+        assert await numbers(1, 9) == []
+        assert await numbers(1 << 62, end) == list(range(1, end))
 
     with_history(tmp_path, test)
 
@@ -226,7 +251,7 @@ class HangingDisk:
         assert self.goes_on.wait(PATIENCE_S)
         self.written += [event["seq"] for event in events]
 
-    def find(self, after: int, limit: int, kinds: tuple[str, ...]) -> list[Mapping[str, Any]]:
+    def find(self, after: int, *_: object) -> list[Mapping[str, Any]]:
         return [{"seq": after + 1}]
 
     def close(self) -> None:

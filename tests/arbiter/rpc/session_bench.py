@@ -58,7 +58,12 @@ class Bench:
         return no_reason(consumer)
 
     def history(
-        self, after: int, limit: int, kinds: tuple[str, ...], done: Callable[[HistoryReply], None]
+        self,
+        after: int,
+        limit: int,
+        kinds: tuple[str, ...],
+        done: Callable[[HistoryReply], None],
+        before: int | None,
     ) -> None:
         self.questions.append((after, limit, kinds))
         done(NO_EVENTS)

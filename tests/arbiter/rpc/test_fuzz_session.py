@@ -175,7 +175,12 @@ class Plant:
         return getattr(self.table, name)
 
     def _read(
-        self, after: int, limit: int, kinds: tuple[str, ...], done: Callable[[HistoryReply], None]
+        self,
+        after: int,
+        limit: int,
+        kinds: tuple[str, ...],
+        done: Callable[[HistoryReply], None],
+        before: int | None,
     ) -> None:
         done(NO_EVENTS)
 

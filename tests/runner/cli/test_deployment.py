@@ -2,6 +2,7 @@
 fits the robot, the dry run.
 """
 
+import importlib.util
 import os
 import re
 import socket
@@ -258,6 +259,19 @@ def test_mistakes_of_all_sections_are_named_at_once(dry_run: DryRun) -> None:
     assert re.search(r"robot\.yaml:4: hal\.transport\.port: ", err), err
     assert re.search(r"robot\.yaml:8: sensors\[0\]\.backend_params\.devise: unknown key", err), err
     assert re.search(r"robot\.yaml:9: sensors\[1\]\.backend: ", err), err
+
+
+def test_a_missing_package_is_told_by_line_with_what_to_install(
+    dry_run: DryRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "cv2" else find(name)
+    )
+    code, _, err = dry_run(f"{TWIN}sensors:\n  - {{sensor_id: a, backend_params: {{device: 0}}}}\n")
+    assert code == 2
+    said = r"robot\.yaml:\d: sensors\[0\]: opencv_thread needs cv2.*vram-arbiter\[runner\]"
+    assert re.search(said, err), err
 
 
 def test_a_file_that_is_not_there_is_named(capsys: pytest.CaptureFixture[str]) -> None:

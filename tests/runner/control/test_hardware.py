@@ -103,13 +103,13 @@ def test_a_skill_sees_cameras_and_moves_the_motors(
     ended = begin(runner, nod(cameras=("front",), steps=3, on_step=seen.append))
     result = tick(runner, clock)
     assert result.action_applied
-    assert twin.sent[0].joint_names == ("wrist_flex",)
+    assert twin.applied[0].joint_names == ("wrist_flex",)
     assert seen[0].image_frames["front"].data == bytes([255, 0, 0, 0, 0, 255])  # inline, untouched
     assert seen[0].diagnostics == {"front": "ok", "joint_state": "ok"}
     tick(runner, clock, 3)
     on_time = {"late_starts_ms": {"p50": 0.0, "p99": 0.0, "max": 0.0}}
     assert ended == [SkillEnded({"ticks": 3, "withheld": 0, "clamped": 0, **on_time, "nods": 3})]
-    assert len(twin.sent) == 3
+    assert len(twin.applied) == 3
     assert not tick(runner, clock).action_applied  # without a skill nothing is sent
     runner.deactivate()
     assert twin.story == ["connect", "disconnect"]
@@ -129,7 +129,7 @@ def test_what_a_skill_cannot_carry_out_is_withheld_and_fails_the_goal_if_it_last
     tick(runner, clock, WITHHELD_IN_A_ROW_MAX)
     assert isinstance(ended[0].error, ModelError)
     assert ended[0].data["withheld"] == WITHHELD_IN_A_ROW_MAX
-    assert not twin.sent
+    assert not twin.applied
 
 
 class Slide:
@@ -205,13 +205,14 @@ def test_a_stale_camera_withholds_and_fails_the_goal_if_it_lasts(
     if cause == "ends":
         front.feed.end("end of file")
     clock.advance(0.2)
-    asked, sent = skill.taken, len(twin.sent)
+    asked, sent = skill.taken, len(twin.applied)
     result = tick(runner, clock)
     assert not result.action_applied
     assert "is stale" in result.safety_violations[0]
     assert not ended
     tick(runner, clock, 40)
-    assert (skill.taken, len(twin.sent)) == (asked, sent)  # neither asked nor moved, not even once
+    # neither asked nor moved, not even once
+    assert (skill.taken, len(twin.applied)) == (asked, sent)
     assert isinstance(ended[0].error, FrameStale)
     assert {"hangs": "ms old", "ends": "end of file", "is not there": "no such camera"}[
         cause
@@ -227,7 +228,7 @@ def test_a_camera_that_comes_back_in_time_lets_the_goal_go_on(
     front.always = False
     clock.advance(0.2)
     tick(runner, clock, 5)
-    assert not twin.sent
+    assert not twin.applied
     front.always = True
     applied = [tick(runner, clock).action_applied for _ in range(4)]
     assert applied == [False, False, True, True]  # three fresh pictures in a row
@@ -292,7 +293,7 @@ def test_the_gate_is_made_for_the_skill_and_what_it_refuses_is_not_sent(
     assert asked == [skill]
     assert not result.action_applied
     assert "wrist_flex" in result.safety_violations[0]
-    assert not twin.sent
+    assert not twin.applied
 
 
 def test_a_gate_that_cannot_be_made_gives_nobody_the_arm(started: MakeRunner, nod: Any) -> None:
@@ -315,7 +316,7 @@ def test_the_emergency_stop_comes_before_anything_else(
     ended = begin(runner, skill)
     # the step that was under way is not sent any more
     assert not tick(runner, clock).action_applied
-    assert not twin.sent
+    assert not twin.applied
     assert twin.story == ["connect", "halt"]
     assert told == ["a hand is in the way"]
     assert isinstance(ended[0].error, EstopRequested)
@@ -351,7 +352,7 @@ def test_a_goal_whose_actions_all_come_too_late_fails(
     runner = started(deadline_policy=DeadlinePolicy.DROP)
     ended = begin(runner, nod(steps=100, on_step=lambda world: clock.advance(2 * PERIOD_S)))
     tick(runner, clock, 30)
-    assert not twin.sent
+    assert not twin.applied
     assert isinstance(ended[0].error, LimitExceeded)
     assert "too late" in ended[0].error.message
     assert ended[0].data["withheld"] == WITHHELD_IN_A_ROW_MAX
@@ -367,7 +368,7 @@ def test_an_action_that_was_thought_out_for_too_long_is_not_sent(
     result = tick(runner, clock)
     assert not result.action_applied
     assert "the joint state is stale: 0.50 s old" in result.safety_violations[0]
-    assert not twin.sent
+    assert not twin.applied
 
 
 def test_a_tick_says_where_its_time_went(

@@ -131,7 +131,7 @@ async def test_the_stop_fails_the_goal_and_refuses_new_ones(
     reply = await client.estop("a hand is in the way")
     assert "a hand is in the way; all joints stand still" in reply.message
     assert made.twin.story == ["connect", "halt"]
-    sent = len(made.twin.sent)
+    sent = len(made.twin.applied)
     result = await goal.result(60)
     assert (result["status"], result["success"], result["code"]) == (
         "failed",
@@ -145,7 +145,7 @@ async def test_the_stop_fails_the_goal_and_refuses_new_ones(
     await diagnosed(client, "ok")  # it can still be looked at
     again = await client.estop("once more")
     assert "a hand is in the way" in again.message
-    assert len(made.twin.sent) == sent
+    assert len(made.twin.applied) == sent
 
 
 async def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(bench: Any) -> None:
@@ -159,7 +159,7 @@ async def test_a_stop_that_the_loop_does_not_obey_is_said_and_still_latched(benc
         made.skill.go_on.set()
         while "stand still" not in (await client.state())["estop"]:
             await asyncio.sleep(0.01)
-        assert made.twin.sent == []  # what the step came back with was not sent
+        assert made.twin.applied == []  # what the step came back with was not sent
 
 
 async def test_what_was_fresh_is_stale_while_the_loop_hangs(
@@ -222,7 +222,7 @@ async def test_a_flood_of_requests_for_pictures_does_not_keep_the_stop_from_bein
         made.skill.go_on.set()
         answers = await asyncio.gather(*flood, return_exceptions=True)
         assert any(isinstance(answer, LimitExceeded) for answer in answers)
-        assert made.twin.sent == []
+        assert made.twin.applied == []
 
 
 @pytest.mark.parametrize("reason", ["x" * 10_000, "smoke \udcff", "\x1b[2J\n\u202e", ""])
@@ -304,11 +304,11 @@ async def test_a_canceled_goal_leaves_the_arm_where_it_was_sent(
     await made.skill.begun.wait()
     await goal.cancel()
     assert (await goal.result(60))["status"] == "canceled"
-    sent = len(made.twin.sent)
+    sent = len(made.twin.applied)
     ticks = (await client.state())["ticks"]
     while (await client.state())["ticks"] < ticks + 5:
         pass
-    assert len(made.twin.sent) == sent
+    assert len(made.twin.applied) == sent
     assert (await client.state())["estop"] is None
 
 

@@ -158,7 +158,7 @@ def test_a_robot_says_only_what_it_was_told_and_nothing_while_it_sees_nothing(
     runner.begin_skill(skill, GOAL, lambda _: None)
     runner.tick()
     assert list(follower.ticks[0].targets) == ["wrist_flex"]
-    assert follower.ticks[0].targets["wrist_flex"] == twin.sent[0].rows[0][0]
+    assert follower.ticks[0].targets["wrist_flex"] == twin.applied[0].rows[0][0]
     assert follower.ticks[0].base_velocity is None
     assert list(follower.ticks[0].world.image_frames or {}) == ["front"]
     front.always = False

@@ -53,6 +53,7 @@ RECORDED: list[tuple[w.AnyRequest, dict[str, Any]]] = [
     (w.Status(True, after=(0, 1.5, 7)), {"op": "status", "details": True, "after": [0, 1.5, 7]}),
     (w.AskWhy("c"), {"op": "why", "consumer": "c"}),
     (w.History(3, 4, ("oom",)), {"op": "history", "after": 3, "limit": 4, "kinds": ["oom"]}),
+    (w.History(before=9), {"op": "history", "before": 9}),
     (w.Subscribe(), {"op": "subscribe"}),
     (w.Evict("r", "t"), {"op": "evict", "reason": "r", "target": "t"}),
     (w.Kill("r", "t"), {"op": "kill", "reason": "r", "target": "t"}),

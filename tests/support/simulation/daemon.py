@@ -142,7 +142,7 @@ class SimDaemon:
                 operators_gid=None,
             ),
             self._inbox,
-            lambda after, limit, kinds, done: done(HistoryReply((), 0)),
+            lambda after, limit, kinds, done, before: done(HistoryReply((), 0)),
             self,
             lambda: clock.now,
         )
