@@ -1,7 +1,7 @@
 """Declared against measured: what is learnt from a lease's life, and who is told."""
 
 from tests.support.core_driver import CoreDriver, refusal
-from tests.support.scenes import held, in_use, shown
+from tests.support.scenes import in_use, shown
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import GpuId, LeaseId
@@ -84,15 +84,6 @@ def test_the_holders_own_word_counts_where_the_driver_lists_nobody(driver: CoreD
     assert charge(driver, again) == 3
 
 
-def test_drift_is_said_once_a_lease_and_part(driver: CoreDriver) -> None:
-    lived(driver, "det", peak=4, steady=3)
-    assert [(note["part"], note["measured_bytes"] / GIB) for note in driver.notes("drift")] == [
-        ("load_peak", 4),
-        ("steady", 3),
-    ]
-    assert {note["consumer"] for note in driver.notes("drift")} == {"det"}
-
-
 def test_who_holds_less_than_declared_is_named_when_it_leaves(driver: CoreDriver) -> None:
     """Before, it may still be growing into what it declared."""
     det = driver.consumer("det")
@@ -107,16 +98,6 @@ def test_who_holds_less_than_declared_is_named_when_it_leaves(driver: CoreDriver
     (note,) = driver.notes("drift")
     assert (note["part"], note["drift_bytes"]) == ("steady", -GIB)
     assert "below" in note["reason"]
-
-
-def test_within_the_tolerance_nobody_drifts(driver: CoreDriver) -> None:
-    det = driver.consumer("det")
-    lease = det.acquire(2 * GIB)
-    det.load(lease, measured_bytes=2 * GIB + 60 * MIB)
-    driver.advance(2.0)
-    det.unload(lease)
-    assert driver.notes("drift") == []
-    assert "drift_bytes" not in (driver.view(lease) or {})
 
 
 def test_a_load_that_is_cut_off_teaches_only_that_it_was_too_much(driver: CoreDriver) -> None:
@@ -196,12 +177,3 @@ def test_a_lease_that_comes_back_after_a_restart_is_measured_on(driver: CoreDriv
     det.unload(lease)
     driver.until(lambda: driver.state(lease) == "over", limit_s=20.0)
     assert driver.arbiter.footprints()["det det-model"]["steady"] == [3 * GIB]
-
-
-def test_the_residue_of_a_process_that_exits_teaches_nothing(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 2)
-    driver.advance(1.5)
-    det.release(lease, exiting=True)
-    det.die()
-    driver.advance(1.0)
-    assert "residue" not in driver.arbiter.footprints()["det det-model"]
