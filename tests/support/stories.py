@@ -182,9 +182,7 @@ def _bytes(count: int) -> str:
 
 
 def _short(name: str) -> str:
-    for unit in ("_bytes", "_s", "_ms"):
-        name = name.removesuffix(unit)
-    return name
+    return name.removesuffix("_bytes").removesuffix("_s")
 
 
 def main() -> None:

@@ -98,14 +98,6 @@ def test_the_push_of_a_repeated_evict_puts_off_no_other(driver: CoreDriver, ops:
 
 
 # -- who is meant
-def test_of_a_resident_and_a_waiting_lease_the_resident_is_meant(
-    driver: CoreDriver, ops: Consumer
-) -> None:
-    det, first = held(driver, "det", 5, min_residency_s=100.0)
-    det.acquire(5 * GIB)
-    assert answer(order_of(ops, "pin", "det"))["lease"]["lease_id"] == first
-
-
 @pytest.mark.parametrize("evictable", [True, False])
 def test_every_refusal_says_what_to_do(driver: CoreDriver, ops: Consumer, evictable: bool) -> None:
     _, lease = held(driver, "det", 5, evictable=evictable)
