@@ -249,7 +249,11 @@ def test_no_new_use_once_the_holder_was_asked(driver: CoreDriver) -> None:
     det.use_begin(lease, "old")
     vlm.acquire(5 * GIB)
     assert driver.state(lease) == "revoking"
-    assert refusal(det.use_begin(lease, "new")).code == "lease_revoking"
+    assert refusal(det.use_begin(lease, "new")).details == {
+        "consumer": "det",
+        "state": "revoking",
+        "revoked": {"cause": "waiter", "wanted_by": "vlm"},
+    }
     assert answer(det.use_begin(lease, "old")) == {"uses": 1}, "a repeat of what runs is fine"
 
 

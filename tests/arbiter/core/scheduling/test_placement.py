@@ -133,30 +133,3 @@ def test_a_lease_that_is_away_from_a_gpu_that_is_gone_ends(two_gpus: CoreDriver)
     assert (two_gpus.why("det")["leases"], two_gpus.state(wanted)) == ([], "over")
     _, other = held(two_gpus, "other", 5)
     assert place(two_gpus, other) == ONE, "the daemon grants"
-
-
-def test_one_that_is_too_large_for_a_gpu_keeps_nobody_from_returning_to_it(
-    two_gpus: CoreDriver,
-) -> None:
-    """Regression: it counted as the one before them there, for whom room had to be kept."""
-    large, first = held(two_gpus, "large", 7, gpu="any", standby=True)
-    small, second = held(two_gpus, "small", 5, gpu="any", standby=True)
-    people = [(large, first), (small, second)]
-    for index, (person, lease) in enumerate(list(people)):
-        policy = two_gpus.consumer(f"policy{index}")
-        wanted = policy.acquire(7 * GIB, gpu=str(index))
-        person.unload(lease)
-        two_gpus.until(lambda wanted=wanted: two_gpus.state(wanted) == "loading")
-        policy.load(wanted)
-        policy.use_begin(wanted)
-        two_gpus.advance(0.1)
-        people.append((policy, wanted))
-    tokens = [person.token(lease) for person, lease in people]
-    people.pop()[0].die()
-    two_gpus.shrink(ONE, 6 * GIB)
-    two_gpus.restart()
-    for (person, lease), token in zip(people, tokens, strict=False):
-        person.connect()
-        person.reattach(lease, token, away=two_gpus.state(lease) == "standby")
-    two_gpus.until(lambda: two_gpus.state(second) == "loading", limit_s=20.0)
-    assert (place(two_gpus, second), two_gpus.state(first)) == (ONE, "standby")

@@ -55,18 +55,6 @@ def test_what_standby_looks_like(driver: CoreDriver) -> None:
     assert (why["state"], why["back"], why["ahead"]) == ("standby", "left_for", "policy")
 
 
-def test_it_never_comes_back_beside_the_one_that_it_left_for() -> None:
-    """Even where both would fit: loading beside a running policy takes time from it."""
-    driver = CoreDriver(10 * GIB)
-    other, resident = held(driver, "vlm", 4)
-    _, lease, policy, wanted = sent_away(driver, gib=3, policy_gib=5)
-    other.unload(resident)
-    driver.advance(10.0)
-    assert driver.state(lease) == "standby"
-    policy.unload(wanted)
-    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
-
-
 def test_cancel_on_the_way_to_standby_is_heard(driver: CoreDriver) -> None:
     """Regression: it was refused while the bytes were measured, and the lease came back to a holder
     that did not want it."""
