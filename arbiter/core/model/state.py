@@ -407,7 +407,7 @@ class Core:
         request = lease.request
         self.move(lease, LeaseState.QUEUED, Why.WANTED)
         self.hand_to(lease, client)
-        request.id, request.answered = asked, asked is None
+        request.id = asked
         request.arrived_at, request.arrival = asked_at, self.next_arrival()
         request.planned_gpu = None
         self.enqueue(lease)
@@ -424,10 +424,7 @@ class Core:
         """End a wait with a refusal."""
         self.move(waiter, LeaseState.DENIED, refusal.code)
         self.dequeue(waiter)
-        if waiter.request.answered or waiter.request.id is None:
-            self.push(waiter, DeniedPush(waiter.id, refusal.view()))
-        else:  # it has only just asked
-            self.refuse(waiter.client, waiter.request.id, refusal)
+        self.push(waiter, DeniedPush(waiter.id, refusal.view()))
         self.note(DeniedNote(refusal), waiter)
         self.end(waiter, refusal)
 
