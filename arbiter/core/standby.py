@@ -44,7 +44,6 @@ def go_away(core: Core, lease: Lease, to: LeaseState, verdict: str) -> None:
     lease.gpu = lease.observed.reported_bytes = request.id = None
     request.gpus = tuple(gpu.info.id for gpu in admission.selected(core.gpus, lease.spec))
     request.evicted = []
-    request.answered = True
     request.load_peak_bytes, request.steady_bytes = core.footprints.expected_bytes(lease.spec)
     standby.since = core.now
     core.record_lease(lease)

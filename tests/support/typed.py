@@ -82,6 +82,4 @@ def _check(hint: Any) -> _Check:
     if issubclass(hint, tuple):
         return lambda value: isinstance(value, hint) and None not in value
     cls: type = hint
-    if is_dataclass(cls):
-        return lambda value: isinstance(value, cls) and not mistyped(value)
-    return lambda value: isinstance(value, cls)
+    return lambda value: isinstance(value, cls) and not (is_dataclass(value) and mistyped(value))

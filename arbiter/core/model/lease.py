@@ -129,8 +129,7 @@ class Request:
     steady_bytes: int
     gpus: tuple[GpuId, ...] = ()  # candidates
     uid: int = -1  # of the process; -1: recovered, and not asked again since
-    id: RequestId | None = None  # of the message that is not answered yet
-    answered: bool = False  # the end of the wait is told by push
+    id: RequestId | None = None  # of the message to be answered; None: told by push
     wait_timeout_s: float | None = None
     traceparent: str | None = None
     reason: Wait | None = None  # why it waits
@@ -220,7 +219,6 @@ class Lease:
         revoked = record.state == "revoking"
         state = LeaseState("held" if revoked or record.state == "debt" else record.state)
         assert state in RECOVERED, f"{record.lease_id} cannot be found {state}"
-        request.answered = True
         lease = cls(
             id=LeaseId(record.lease_id),
             spec=record.spec,

@@ -407,7 +407,7 @@ class Core:
         request = lease.request
         self.move(lease, LeaseState.QUEUED, Why.WANTED)
         self.hand_to(lease, client)
-        request.id, request.answered = asked, asked is None
+        request.id = asked
         request.arrived_at, request.arrival = asked_at, self.next_arrival()
         request.planned_gpu = None
         self.enqueue(lease)

@@ -218,15 +218,15 @@ def reacquire(core: Core, asked: ev.Asked, request: w.Reacquire) -> None:
 def answer_queued(core: Core, lease: Lease) -> None:
     """Tell an acquire of this event that the scheduling did not grant that it waits, and why."""
     request = lease.request
-    if lease.state is not LeaseState.QUEUED or request.answered or request.id is None:
+    if lease.state is not LeaseState.QUEUED or request.id is None:
         return
-    request.answered = True
     view = status.view(core, lease)
     ahead = ahead_of(core.gpus, lease)
     gpu = core.gpus[request.planned_gpu or request.gpus[0]]
     block = None if ahead else status.block_view(core, gpu)
     core.note(QueuedNote(view.position, request.reason, ahead, block), lease)
     core.reply(lease.client, request.id, AcquireReply("queued", view))
+    request.id = None
 
 
 def cancel(core: Core, asked: ev.Asked, request: w.Cancel) -> None:

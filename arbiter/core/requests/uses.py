@@ -41,13 +41,8 @@ def begin(core: Core, asked: ev.Asked, request: w.UseBegin) -> None:
     lease = lease_for(core, request)
     key = (client.process, request.use_id)
     known = lease.uses.get(key)
-    use = Use(request.use_id, client.id, client.process, request.label, core.now)
-    use = use if known is None else replace(known, client=client.id)
     if known is not None:
-        lease.uses[key] = use
-        core.reply(asked.client, asked.id, UsesReply(len(lease.uses)))
-        if known.client != FROM_JOURNAL:
-            return
+        use = lease.uses[key] = replace(known, client=client.id)
     else:
         if lease.state in LEAVING and not _was_begun(lease, client, request):
             revoked = None if lease.departure.eviction is None else lease.departure.eviction.why
@@ -55,14 +50,16 @@ def begin(core: Core, asked: ev.Asked, request: w.UseBegin) -> None:
         if lease.state not in (LeaseState.HELD, LeaseState.REVOKING):
             raise bad_state(lease, Misfit.NOT_HELD)
         _check_places(core, lease, client)
+        use = Use(request.use_id, client.id, client.process, request.label, core.now)
         core.mark(lease, use)
         lease.uses.last_at = core.now
         if client.process == lease.process:
             lease.departure.revoked_before = False  # its holder knows that it may stay
         if _is_kept(lease, use):
             core.record_lease(lease)  # before the reply: from then on its user counts on it
-        core.reply(asked.client, asked.id, UsesReply(len(lease.uses)))
-    core.note(UseBeganNote(use.id, use.label, len(lease.uses), known is not None), lease)
+    core.reply(asked.client, asked.id, UsesReply(len(lease.uses)))
+    if known is None or known.client == FROM_JOURNAL:
+        core.note(UseBeganNote(use.id, use.label, len(lease.uses), known is not None), lease)
 
 
 def _was_begun(lease: Lease, client: Client, request: w.UseBegin) -> bool:

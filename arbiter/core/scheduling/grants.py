@@ -233,13 +233,10 @@ def grant(core: Core, gpu: Gpu, lease: Lease) -> None:
     core.timers.set(("ttl", lease.id), lease.expires_at)
     core.record_lease(lease, gates=True)
     view = status.view(core, lease)
-    if request.answered:
+    if request.id is None:
         core.push(lease, GrantedPush(view))
-        request.id = None
     else:
-        assert request.id is not None, f"{lease.id} was never asked for"
         core.reply(lease.client, request.id, AcquireReply("loading", view))
-        request.answered = True
     note = GrantedNote(
         charge_bytes=peak,
         waited_ms=(core.now - request.arrived_at) * 1e3,

@@ -218,17 +218,13 @@ def _take_evidence(core: Core, gpu: Gpu, reading: MemorySampled) -> None:
         if before is None or use.held_bytes > before.held_bytes + tolerance_bytes:
             core.note(StowawayNote(gpu.info.id, use.process.pid, use.name, use.held_bytes))
     for account in list(ledger.accounts.values()):
-        if account.charges or account.process in verified:
+        if account.charges or account.process in verified or reading.taken_at <= account.changed_at:
             continue
-        lives = account.process in core.connected or not core.serving
-        least_bytes = max(account.measured_bytes, account.retained_floor_bytes if lives else 0)
-        shows_less = least_bytes + tolerance_bytes < account.retained_bytes
-        if shows_less and reading.taken_at > account.changed_at:
-            gone = account.process not in core.connected and core.serving
-            retained_bytes = ledger.leftover_bytes(account, reading, gone=gone)
-            if retained_bytes + tolerance_bytes < account.retained_bytes:
-                ledger.retain(account.process, retained_bytes, core.now)
-                core.record_residue(gpu, account.process, retained_bytes)
+        gone = account.process not in core.connected and core.serving
+        retained_bytes = ledger.leftover_bytes(account, reading, gone=gone)
+        if retained_bytes + tolerance_bytes < account.retained_bytes:
+            ledger.retain(account.process, retained_bytes, core.now)
+            core.record_residue(gpu, account.process, retained_bytes)
 
 
 def on_probe_failed(core: Core, event: ProbeFailed) -> None:

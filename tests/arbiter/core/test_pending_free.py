@@ -43,6 +43,9 @@ def test_what_a_process_takes_again_is_not_on_its_way() -> None:
     pending.give_up(A, 300, 10.0)
     pending.give_up(A, -300, 11.0)
     assert pending.since(9.0) == 0
+    pending.give_up(B, 1, 12.0)
+    pending.give_up(B, 1, 13.0)
+    assert pending.since(12.5) == 2, "the newest counts for all"
 
 
 def test_two_readings_say_what_was_given_up_between_them() -> None:

@@ -114,7 +114,7 @@ def test_a_restart_finds_a_lease_as_the_journal_has_it(
     before = driver.arbiter.inspect().leases[lease]
     driver.restart(start=False)
     core, now = state_of(driver.arbiter), driver.now
-    request = Request("n1", now, 1, 5 * GIB, 4 * GIB, (GpuId("GPU-0"),), answered=True)
+    request = Request("n1", now, 1, 5 * GIB, 4 * GIB, (GpuId("GPU-0"),))
     found = Lease(
         lease,
         before.spec,

@@ -237,6 +237,18 @@ def test_while_a_context_is_measured_small_ones_pass_a_head_that_waits_for_a_hol
     assert driver.state(small) == "loading"
 
 
+def test_bytes_whose_verdict_is_late_are_counted_on_no_longer(driver: CoreDriver) -> None:
+    goes, going = held(driver, "goes", 3.6, priority=10)
+    _, idle = held(driver, "idle", 3.7)
+    driver.consumer("w").acquire(int(3.9 * GIB))
+    driver.device.silent = True
+    goes.unload(going)
+    driver.advance(d.VERIFY_TIMEOUT_S - 0.001)
+    assert (driver.state(going), driver.state(idle)) == ("verifying", "held")
+    driver.advance(0.001)
+    assert driver.state(idle) == "revoking"
+
+
 @pytest.mark.parametrize("late", [False, True])
 def test_a_small_one_waits_for_an_unload_that_is_not_late(driver: CoreDriver, late: bool) -> None:
     in_use(driver, "busy", 3, priority=90)

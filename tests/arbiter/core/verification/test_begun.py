@@ -133,17 +133,18 @@ def test_what_a_holder_declared_may_stay_only_while_it_lives(
     assert found.baseline is None or found.baseline.used_bytes == 5 * GIB
 
 
-@pytest.mark.parametrize("seen", [True, False], ids=["seen", "not seen yet"])
+@pytest.mark.parametrize("later_s", [0.001, 0.0, -0.001])
 def test_what_a_dead_process_kept_is_compared_with_the_newest_reading(
-    driver: CoreDriver, seen: bool
+    driver: CoreDriver, later_s: float
 ) -> None:
+    """`later_s`: how much later than the charge it began."""
     det, lease = held(driver, "det", 5, residue_bytes=RESIDUE_BYTES)
     give_back(driver, det, lease)
-    if seen:
-        driver.advance(1.0)
     driver.device.lag_s = 1.0
-    baseline = state_of(driver.arbiter).gpus[driver.device.gpu].sample
+    gpu = state_of(driver.arbiter).gpus[driver.device.gpu]
+    baseline = gpu.sample
     assert baseline is not None
+    gpu.ledger.accounts[det.process].changed_at = baseline.taken_at - later_s
     det.die()
     assert under_way(driver) == begun(
         driver.now,
@@ -153,6 +154,6 @@ def test_what_a_dead_process_kept_is_compared_with_the_newest_reading(
         consumer=str(det.process),
         model="",
         baseline=baseline,
-        baseline_comparable=seen,
+        baseline_comparable=later_s > 0,
         **DEAD,
     )

@@ -54,10 +54,10 @@ def under_way(driver: CoreDriver) -> tuple[Core, Gpu, Verification]:
 @pytest.mark.parametrize(
     ("waited_s", "usual_s", "reading_s", "left_s", "pause_s"),
     [
-        # dense for 2 s, then for 3 s less
+        # dense for a second, then for 4 s less
         (0.0, 0.0, 0.001, 9.0, 0.005),
-        (1.999, 0.0, 0.001, 9.0, 0.005),
-        (2.0, 0.0, 0.001, 9.0, 0.020),
+        (0.999, 0.0, 0.001, 9.0, 0.005),
+        (1.0, 0.0, 0.001, 9.0, 0.020),
         (4.999, 0.0, 0.001, 9.0, 0.020),
         (5.0, 0.0, 0.001, 9.0, 0.050),
         # for half as long again as it usually takes
@@ -78,13 +78,13 @@ def under_way(driver: CoreDriver) -> tuple[Core, Gpu, Verification]:
     ],
 )
 def test_readings_are_dense_while_memory_usually_comes_back_and_rarer_later(
-    driver: CoreDriver,
     waited_s: float,
     usual_s: float,
     reading_s: float,
     left_s: float,
     pause_s: float,
 ) -> None:
+    driver = CoreDriver(8 * GIB, settings={"verify_poll_until_s": (1.0, 5.0)})
     det, lease = held(driver, "det", 5)
     det.unload(lease)
     core, gpu, one = under_way(driver)
@@ -284,6 +284,21 @@ def test_what_a_load_has_not_taken_yet_hides_nobodys_bytes(driver: CoreDriver) -
         3.0, abs=0.05
     )
     assert (driver.state(second), verdicts(driver)) == ("loading", [("verified", True)])
+
+
+def test_while_a_load_hides_what_has_gone_the_deadline_is_put_off(driver: CoreDriver) -> None:
+    """Nothing could be granted anyway before the load ends."""
+    total_only(driver)
+    det, lease = held(driver, "det", 2)
+    loads = driver.consumer("loads")
+    loading = loads.acquire(3 * GIB)
+    loads.hold(2 * GIB)
+    det.unload(lease)
+    driver.advance(2 * d.VERIFY_TIMEOUT_S)
+    (one,) = state_of(driver.arbiter).gpus[GPU].verifications.values()
+    assert one.deadline_at == pytest.approx(driver.now + d.VERIFY_TIMEOUT_S, abs=0.1)
+    loads.load(loading)
+    driver.until(lambda: driver.state(lease) == "over", limit_s=0.1)
 
 
 def test_lists_tell_a_load_from_what_has_not_gone_though_there_is_no_list_of_before() -> None:
