@@ -158,6 +158,7 @@ def _writer(kind: type) -> Callable[[_Part, Any], None]:
         return lambda part, some: part.put_all((len(some), *some))
     if is_dataclass(kind):
         names = [one.name for one in fields(kind) if one.name not in LEFT_OUT]
+        # two more than the fields: of one name it returns no tuple
         values = attrgetter("__class__.__name__", "__module__", *names)
         return lambda part, value: part.put_all(values(value))
     return lambda part, value: part.put_all(
