@@ -29,7 +29,7 @@ from vram_arbiter.clients.cli.demo_report import (
     returned,
     summarise,
 )
-from vram_arbiter.clients.cli.programs import Program, Programs
+from vram_arbiter.clients.cli.programs import Child, Programs
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.runner import RunnerClient
@@ -361,7 +361,7 @@ async def _until_up(programs: Programs, ping: Any) -> None:
 
 async def _watch(
     programs: Programs,
-    reasoner: Program,
+    reasoner: Child,
     client: AsyncClient | None,
     display: Display,
     watch: Watch,
@@ -411,12 +411,12 @@ async def _look(client: AsyncClient | None, display: Display, watch: Watch) -> N
         display.event(event, event["at_wall_s"] - watch.wall_offset_s - watch.start_s)
 
 
-def _check_others(programs: Programs, reasoner: Program) -> None:
+def _check_others(programs: Programs, reasoner: Child) -> None:
     if reasoner.process.returncode is None:
         programs.check()
 
 
-def _last_line(program: Program) -> str:
+def _last_line(program: Child) -> str:
     lines = program.log.read_text(errors="replace").splitlines()
     return lines[-1].partition("reasoner.loop ")[2] if lines else ""
 

@@ -26,7 +26,7 @@ LOG_TAIL_LINES = 15
 
 
 @dataclass(slots=True)
-class Program:
+class Child:
     """One child process, of these words, and where its output goes."""
 
     name: str
@@ -52,11 +52,11 @@ class Programs:
 
     log_dir: Path
     environ: dict[str, str]
-    running: dict[str, Program] = field(default_factory=dict)
+    running: dict[str, Child] = field(default_factory=dict)
 
     async def start(
         self, name: str, package: str, *arguments: str, asked: bool = False, **environ: str
-    ) -> Program:
+    ) -> Child:
         """Start `python -m vram_arbiter.PACKAGE ARGUMENTS`, which dies with this process; its
         output goes to `<log_dir>/<name>.log`. `asked`: it reads from this process, and answers on
         its standard output."""
@@ -71,7 +71,7 @@ class Programs:
                 preexec_fn=dying_with_parent(),
             )  # fmt: skip
         words = (package, *arguments)
-        program = self.running[name] = Program(name, words, process, log)
+        program = self.running[name] = Child(name, words, process, log)
         return program
 
     async def restart(self, name: str, number: signal.Signals = signal.SIGTERM) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from vram_arbiter.clients.calibration.gpu import Gpu, Reading
-from vram_arbiter.clients.cli.programs import Program, Programs
+from vram_arbiter.clients.cli.programs import Child, Programs
 from vram_arbiter.clients.client import AsyncClient
 from vram_arbiter.clients.configs import configs_folder
 from vram_arbiter.clients.sidecar.build import CLIENTS
@@ -43,7 +43,7 @@ class Missed(Exception):
     """A row found something else than the product claims; the text says what."""
 
 
-async def ask(holder: Program, word: str, *sizes: int) -> JsonMap:
+async def ask(holder: Child, word: str, *sizes: int) -> JsonMap:
     """Return the answer of a holder to a request of `sidecars.holder`. Raises SidecarUnavailable
     where it has failed."""
     asked, answers = holder.process.stdin, holder.process.stdout
@@ -107,7 +107,7 @@ class Bed:
     @asynccontextmanager
     async def holder(
         self, lease: str = "", size_bytes: int | None = None, **environ: str
-    ) -> AsyncIterator[Program]:
+    ) -> AsyncIterator[Child]:
         """Start a process that holds a context and so many bytes (None: neither), and end it again:
         under a lease of that name (`vramctl run`), or without one, which makes it a stowaway. Its
         bytes are back at the end of the block.
