@@ -193,9 +193,9 @@ class Client:
         self.protocol.holdings.use_begin(self._held, USE, "", world.now)
 
     def do_ahead(self, world: "World") -> None:
-        """A use begins ahead of the answer; where that refuses it, it goes on to its end."""
+        """A use begins ahead of the answer."""
         self.uses = True
-        self.do_use(world)
+        self.protocol.holdings.use_begin(self._held, USE, "", world.now, begun=True)
 
     def do_end(self, world: "World") -> None:
         self.uses = False
@@ -324,7 +324,7 @@ class Client:
             leaves = record.revoke is not None and not record.withdrawn
             if usable and leaves != (lease.state is LeaseState.REVOKING):
                 raise Broken(f"{self.name} believes of {id}, {lease.state}: revoked {leaves}")
-            if len(record.uses) != len(lease.uses):
+            if not len(record.uses) == len(lease.uses) == self.uses:
                 raise Broken(f"{self.name} believes of {id}: {record.uses} of {lease.uses} uses")
         for waiter in self.protocol.waits.waiters.values():
             if agrees and waiter.lease_id not in core.waiting:
