@@ -54,8 +54,9 @@ from vram_arbiter.schemas.wire.spec import LeaseSpec
 from vram_arbiter.schemas.wire.views import DaemonView, DemandView, SensorsView
 
 HISTORY_PAGE = 2000
-SEQ_END = (1 << 63) - 1  # SQLite knows no greater number
 """Events in one reply, whatever was asked for: packing more would hold the loop for too long."""
+SEQ_END = (1 << 63) - 1
+"""SQLite knows no greater number."""
 _HOLDING = (w.Acquire, w.Reacquire, w.Reattach, w.UseBegin)
 """Requests that can make the engine remember something of a client beyond its connection."""
 _KINDS = frozenset((*NOTES, *DAEMON_KINDS))

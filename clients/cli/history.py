@@ -185,10 +185,12 @@ def collect(wanted: Wanted, endpoint: str | None) -> Message:
         events = reply.get("events", [])
         fitting = [event for event in events if wanted.fits(event)]
         found[:0] = [event for event in fitting if not wanted.folds(event)]
+        if wanted.after is not None:
+            del found[wanted.limit :]
         folded += [event["seq"] for event in fitting if wanted.folds(event)]
         enough = wanted.after is None and len(found) >= wanted.limit
         if enough or len(events) < PAGE or wanted.too_old(events[0]):
-            shown = found[-wanted.limit :] if wanted.after is None else found[: wanted.limit]
+            shown = found[-wanted.limit :]
             first = shown[0]["seq"] if shown else 0
             told = {} if wanted.quiet else {"folded": sum(seq > first for seq in folded)}
             return {**reply, "events": shown, **told}
