@@ -31,7 +31,7 @@ BY_FILE := --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help setup setup-core setup-worlds setup-vllm jetson demo test test-core test-gpu nightly mutation fuzz measure lint format \
-	explore lock sbom wheel chaos sim bench bench-doors bench-fleet bench-gateway bench-switch schemas docs clean
+	explore stories lock sbom wheel chaos sim bench bench-doors bench-fleet bench-gateway bench-switch schemas docs clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -69,6 +69,9 @@ nightly: setup setup-worlds setup-vllm ## random histories of the engine: HISTOR
 	.venv-worlds/bin/pytest -q -m nightly tests/runner/sim/test_lerobot_worlds.py
 	$(TOOL) tests/nightly/nightly_run.py --histories $(HISTORIES) \
 		$(if $(MACHINE),--machine $(MACHINE)) $(if $(filter-out 0,$(SEED)),--seed $(SEED)) $(ARGS)
+
+stories: setup ## write the answers in tests/arbiter/core/stories anew, for their diff
+	$(TOOL) -m tests.support.stories tests/arbiter/core/stories/*.txt
 
 explore: MINUTES = 60
 explore: setup ## all orders of events of small worlds: MINUTES=60 WORLD=turns

@@ -17,8 +17,8 @@ from typing import Any
 
 import msgpack
 
+from tests.support.core_checks import well_formed, well_typed
 from tests.support.full_check import check_arbiter
-from tests.support.typed import mistyped
 from vram_arbiter.arbiter.core.arbiter import Arbiter
 from vram_arbiter.arbiter.core.effects import (
     Effect,
@@ -45,7 +45,6 @@ from vram_arbiter.arbiter.core.events import (
     Tick,
 )
 from vram_arbiter.arbiter.core.model.refusals import NotJournaled
-from vram_arbiter.arbiter.core.model.state import Inspection
 from vram_arbiter.arbiter.core.settings import GpuInfo, Settings
 from vram_arbiter.arbiter.host.records import records_of
 from vram_arbiter.arbiter.rpc import words
@@ -54,7 +53,6 @@ from vram_arbiter.schemas.codec import from_map, to_map
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, RequestId, Token, UseId
 from vram_arbiter.schemas.wire import requests as w
 from vram_arbiter.schemas.wire.errors import ErrorView
-from vram_arbiter.schemas.wire.notes import OperatorNote, RefusedNote
 from vram_arbiter.schemas.wire.replies import AcquireReply
 from vram_arbiter.schemas.wire.spec import Footprint, LeaseSpec
 
@@ -141,6 +139,7 @@ class CoreDriver:
         reserve_bytes: int = d.RESERVE_BYTES,
         settings: Mapping[str, Any] | None = None,
         start: bool = True,
+        engine: Callable[[Settings, float], Arbiter] = Arbiter,
     ) -> None:
         self.now = START_S
         infos = tuple(
@@ -156,7 +155,8 @@ class CoreDriver:
         )
         self.devices = {info.id: SimDevice(info.id, capacity_bytes) for info in infos}
         self.settings = Settings(epoch=1, gpus=infos, **(settings or {}))
-        self.arbiter = Arbiter(self.settings, self.now)
+        self._engine = engine
+        self.arbiter = engine(self.settings, self.now)
         self.effects: list[Effect] = []
         self.events: list[tuple[float, Event]] = []
         self.journal: dict[str, Mapping[str, Any]] = {}
@@ -180,7 +180,7 @@ class CoreDriver:
         self.events.append((self.now, event))
         effects = self.arbiter.handle(event, self.now)
         check_arbiter(self.arbiter)
-        _well_formed(event, effects, self.arbiter.inspect())
+        well_formed(event, effects, self.arbiter.inspect())
         failed: list[JournalPut] = []
         held_back: list[JournalPut] = []
         performed: list[Effect] = []
@@ -263,7 +263,7 @@ class CoreDriver:
         """kill -9 of the daemon: a new core, the journal's records, no memory of anything else.
         `start`: until the first reading."""
         self.settings = replace(self.settings, epoch=epoch)
-        self.arbiter = Arbiter(self.settings, self.now)
+        self.arbiter = self._engine(self.settings, self.now)
         self._readings.clear()
         self.post(Recovered(records_of(self.journal) if keep_journal else {}))
         if start:
@@ -306,7 +306,7 @@ class CoreDriver:
         """The status as the wire shows it."""
         page: Any = None if after is None else tuple(after)
         told = self.arbiter.status(self.now, reader, page, limit, details=details)
-        _well_typed(told)
+        well_typed(told)
         return as_wire(words.reply(told))
 
     def blocked(self, index: int = 0) -> str:
@@ -317,7 +317,7 @@ class CoreDriver:
     def why(self, consumer: str) -> dict[str, Any]:
         """The answer to `why` as the wire shows it, with its words."""
         told = self.arbiter.why(consumer, self.now)
-        _well_typed(told)
+        well_typed(told)
         return as_wire(words.reply(told))
 
     def state(self, lease: LeaseId) -> str:
@@ -590,46 +590,6 @@ def answer(effects: Sequence[Effect]) -> Mapping[str, Any]:
     if len(found) != 1:
         raise AssertionError(f"{len(found)} replies in {list(effects)}")
     return as_wire(words.reply(found[0].body))
-
-
-NOT_OF_A_LEASE = frozenset(
-    [
-        "pressure",
-        "stowaway",
-        "probe_failed",
-        "probe_ok",
-        "journal_failed",
-        "recovered",
-        "serving",
-        "resumed",
-        "drain",
-        "resume",
-    ]
-)
-"""Kinds of notes, and an operator's orders, that are about a GPU or the daemon."""
-
-
-def _well_formed(event: Event, effects: Sequence[Effect], state: Inspection) -> None:
-    """Every request has its one answer, notes name their lease, and every field of an effect, and of
-    the leases that notes are about, is of its type. Raises AssertionError."""
-    asked = [(event.client, event.id)] if isinstance(event, Asked) else []
-    answered = [(e.client, e.request) for e in effects if isinstance(e, Reply | Refuse)]
-    if answered != asked:
-        raise AssertionError(f"{asked} asked, {answered} answered: {effects}")
-    for note in (e for e in effects if isinstance(e, Note)):
-        name = note.body.action if isinstance(note.body, OperatorNote) else note.kind
-        may_be_either = isinstance(note.body, RefusedNote)
-        if not may_be_either and (note.about is None) != (name in NOT_OF_A_LEASE):
-            raise AssertionError(f"about another thing: {note}")
-    abouts = [e.about for e in effects if isinstance(e, Note) and e.about is not None]
-    told = {about.lease_id for about in abouts if about.lease_id is not None}
-    known = [table[lease] for table in (state.leases, state.ended) for lease in told & table.keys()]
-    _well_typed(*effects, *known)
-
-
-def _well_typed(*told: object) -> None:
-    if odd := next(filter(None, map(mistyped, told)), ""):
-        raise AssertionError(f"not of its type: {odd}")
 
 
 def _names(effect: Effect, lease: str) -> bool:

@@ -421,7 +421,7 @@ class Core:
             self.gpus[gpu_id].wake()
 
     def deny(self, waiter: Lease, refusal: Refusal) -> None:
-        """End a wait with a refusal."""
+        """End a wait with a refusal. Its request was answered as queued."""
         self.move(waiter, LeaseState.DENIED, refusal.code)
         self.dequeue(waiter)
         self.push(waiter, DeniedPush(waiter.id, refusal.view()))

@@ -7,40 +7,6 @@ from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ClientId
 
 
-def test_revoke_is_sent_again_until_acknowledged(driver: CoreDriver) -> None:
-    det, lease = in_use(driver, "det", 5)
-    waiter = driver.consumer("vlm").acquire(5 * GIB)
-    (first,) = driver.pushes("revoke")
-    assert first == {
-        "push": "revoke",
-        "lease_id": lease,
-        "token": [det.token(lease).epoch, det.token(lease).serial],
-        "reason": "vlm needs the room",
-        "cause": "waiter",
-        "wanted_by": "vlm",
-        "priority": 50,
-        "deadline_in_s": 30.0,
-        "uses": 1,
-        "park": False,
-    }
-    driver.advance(1.01)
-    assert len(driver.pushes("revoke")) == 5, "every 250 ms"
-    det.ack(lease, 4.0)
-    det.ack(lease, 3.0)
-    assert len(driver.notes("revoke_acked")) == 1
-    driver.advance(1.5)
-    assert len(driver.pushes("revoke")) == 5, "heard"
-    assert [note["uses"] for note in driver.notes("reminded")] == [1]
-    det.use_end(lease)
-    assert driver.pushes("revoke")[-1]["uses"] == 0
-    driver.advance(0.6)
-    assert len(driver.pushes("revoke")) == 8, "at the safe point it is reminded until it unloads"
-    det.unloading(lease)
-    driver.advance(31.0)
-    assert len(driver.pushes("revoke")) == 8, "one that unloads is pushed nothing more, if late"
-    assert driver.state(waiter) == "queued"
-
-
 def test_a_waiter_that_is_patient_waits_past_the_deadline(driver: CoreDriver) -> None:
     det, lease = in_use(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
@@ -70,16 +36,6 @@ def test_a_holder_that_does_not_answer_at_the_deadline_no_longer_counts_as_leavi
     driver.until(lambda: driver.state(waiter) == "loading")
 
 
-def test_an_unload_that_hangs_is_late_and_not_reminded(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5)
-    driver.consumer("vlm").acquire(5 * GIB)
-    driver.advance(0.1)
-    det.unloading(lease)
-    driver.advance(driver.settings.revoke_deadline_s + 0.1)
-    assert len(driver.notes("deadline_passed")) == 1
-    assert driver.notes("reminded") == []
-
-
 def test_a_voluntary_release_while_asked_is_as_good(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5)
     waiter = driver.consumer("vlm").acquire(5 * GIB)
@@ -90,18 +46,6 @@ def test_a_voluntary_release_while_asked_is_as_good(driver: CoreDriver) -> None:
     det.release(lease)
     driver.until(lambda: driver.state(waiter) == "loading")
     assert driver.state(lease) == "over"
-
-
-def test_death_while_asked_counts_as_leaving(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5)
-    vlm = driver.consumer("vlm")
-    waiter = vlm.acquire(5 * GIB)
-    driver.advance(0.1)
-    det.die()
-    driver.until(lambda: driver.state(waiter) == "loading")
-    vlm.load(waiter)
-    (gone,) = driver.notes("switch")[-1]["evicted"]
-    assert (gone["lease_id"], gone["verdict"]) == (lease, "verified")
 
 
 def test_a_reminder_between_two_pushes_pushes_nothing() -> None:

@@ -132,28 +132,6 @@ def test_only_what_another_waiter_needs_stays_revoked(driver: CoreDriver) -> Non
     driver.until(lambda: driver.state(little) == "loading")
 
 
-def test_an_operators_order_stands(driver: CoreDriver) -> None:
-    holder, lease, waiter, wanted = revoked_in_use(driver)
-    order(driver, "evict", lease)
-    waiter.cancel(wanted)
-    driver.advance(1.0)
-    assert driver.state(lease) == "revoking"
-    holder.use_end(lease)
-    give_back(driver, holder, lease)
-
-
-def test_a_revoke_for_pressure_ends_with_the_pressure(driver: CoreDriver) -> None:
-    _, lease = held(driver, "train", 5)
-    stranger = driver.consumer("stranger")
-    stranger.leave()
-    driver.device.set(stranger.process, 4 * GIB, driver.now)
-    driver.until(lambda: driver.state(lease) == "revoking")
-    driver.device.set(stranger.process, 0, driver.now)
-    driver.until(lambda: driver.state(lease) == "held")
-    (note,) = driver.notes("revoke_withdrawn")
-    assert note["cause"] == "pressure"
-
-
 def test_a_release_that_crosses_the_withdrawal_is_that_of_an_eviction() -> None:
     """The holder acted on the revoke before it heard of the withdrawal: a lease on standby comes
     back, and its weights stay in host RAM."""

@@ -3,8 +3,7 @@
 import pytest
 
 from tests.support.core_driver import CoreDriver, refusal
-from tests.support.scenes import held, in_use, revoked, shown
-from vram_arbiter.arbiter.core.effects import Sample
+from tests.support.scenes import in_use, revoked, shown
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import GpuId, LeaseId
@@ -79,16 +78,6 @@ def test_the_holders_own_word_counts_where_the_driver_lists_nobody(driver: CoreD
     assert charge(driver, again) == 3
 
 
-def test_drift_is_said_once_a_lease_and_part(driver: CoreDriver) -> None:
-    lived(driver, "det", peak=4, steady=3)
-    names = ("consumer", "part", "declared_bytes", "measured_bytes", "drift_bytes")
-    noted = [tuple(note[name] for name in names) for note in driver.notes("drift")]
-    assert noted == [
-        ("det", "load_peak", 2 * GIB, 4 * GIB, 2 * GIB),
-        ("det", "steady", 1 * GIB, 3 * GIB, 2 * GIB),
-    ]
-
-
 def test_who_holds_less_than_declared_is_named_when_it_leaves(driver: CoreDriver) -> None:
     """Before, it may still be growing into what it declared."""
     det = driver.consumer("det")
@@ -124,16 +113,6 @@ def test_within_the_tolerance_nobody_drifts(
     driver.advance(2.0)
     det.unload(lease)
     assert [note["part"] for note in driver.notes("drift")] == parts
-
-
-def test_while_somebody_loads_the_gpu_is_read_twenty_times_a_second(driver: CoreDriver) -> None:
-    driver.consumer("det").acquire(2 * GIB)
-    driver.advance(0.1)
-    before = len(driver.effects)
-    driver.advance(1.0)
-    assert sum(isinstance(effect, Sample) for effect in driver.effects[before:]) == pytest.approx(
-        20, abs=1
-    )
 
 
 def test_a_load_that_is_cut_off_teaches_only_that_it_was_too_much(driver: CoreDriver) -> None:
@@ -227,12 +206,3 @@ def test_a_lease_that_comes_back_after_a_restart_is_measured_on(driver: CoreDriv
     det.unload(lease)
     driver.until(lambda: driver.state(lease) == "over", limit_s=20.0)
     assert driver.arbiter.footprints()["det det-model"]["steady"] == [3 * GIB]
-
-
-def test_the_residue_of_a_process_that_exits_teaches_nothing(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 2)
-    driver.advance(1.5)
-    det.release(lease, exiting=True)
-    det.die()
-    driver.advance(1.0)
-    assert "residue" not in driver.arbiter.footprints()["det det-model"]

@@ -1,46 +1,16 @@
 """Views, `status`, `why` and the record of a switch."""
 
-from dataclasses import replace
-
 import pytest
 
 from tests.support.core_driver import CoreDriver
-from tests.support.scenes import held, in_use, shown, why
-from vram_arbiter.arbiter.core.effects import Note
-from vram_arbiter.arbiter.core.events import Asked
+from tests.support.scenes import held, in_use, why
 from vram_arbiter.schemas.defaults import (
     GIB,
     MIB,
     RESERVE_BYTES,
-    REVOKE_DEADLINE_S,
     VERIFY_TIMEOUT_S,
 )
-from vram_arbiter.schemas.ids import GpuId, ProcessKey
-from vram_arbiter.schemas.wire.requests import Acquire
-
-
-def test_status_shows_holders_first_then_the_queue_in_order(driver: CoreDriver) -> None:
-    busy, lease = in_use(driver, "busy", 5)
-    driver.consumer("late").acquire(5 * GIB)
-    driver.consumer("urgent").acquire(5 * GIB, priority=90)
-    driver.device.names[ProcessKey(9, 9)] = "browser"
-    driver.device.set(ProcessKey(9, 9), 100 * MIB, driver.now)
-    driver.advance(1.5)
-    status = driver.status()
-    assert [view["consumer"] for view in status["leases"]] == ["busy", "urgent", "late"]
-    assert [view.get("position") for view in status["leases"]] == [None, 1, 2]
-    assert (status["epoch"], status["phase"], status["clients"]) == (1, "serving", 3)
-    (gpu,) = status["gpus"]
-    assert gpu["charged_bytes"] == 5 * GIB
-    assert gpu["stowaway_bytes"] == 100 * MIB
-    assert gpu["measured_used_bytes"] == 5 * GIB + 100 * MIB
-    assert [p["charged_bytes"] for p in gpu["processes"] if p["stowaway"]] == [0]
-    assert [(p["name"], p["stowaway"], p["lease_ids"]) for p in gpu["processes"]] == [
-        ("busy", False, [lease]),
-        ("browser", True, []),
-    ]
-    busy.release(lease)
-    assert "ttl_left_s" not in shown(driver, lease)
+from vram_arbiter.schemas.ids import ProcessKey
 
 
 def test_before_the_first_reading_nothing_is_known() -> None:
@@ -48,10 +18,6 @@ def test_before_the_first_reading_nothing_is_known() -> None:
     gpu = driver.gpu()
     assert (gpu["measured_used_bytes"], gpu["sample_age_s"], gpu["processes"]) == (None, None, [])
     assert gpu["blocked"]["text"] == "the GPU has not been read yet"
-
-
-def test_why_of_a_stranger_is_empty() -> None:
-    assert CoreDriver().why("nobody") == {"consumer": "nobody", "leases": []}
 
 
 def test_why_of_a_resident_lease_says_what_it_is_doing(driver: CoreDriver) -> None:
@@ -122,15 +88,6 @@ def test_why_follows_the_way_of_the_holder(driver: CoreDriver) -> None:
         "det unloads, then 5.30 GiB are verified",
         "5.30 GiB of det are being verified",
     ]
-
-
-def test_why_names_the_process_of_an_unload_that_hangs(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5)
-    driver.consumer("vlm").acquire(5 * GIB)
-    det.unloading(lease)
-    driver.advance(REVOKE_DEADLINE_S + 0.1)
-    (blocker,) = why(driver, "vlm")["blockers"]
-    assert (blocker["condition"], blocker["pid"]) == ("hanging", det.process.pid)
 
 
 def test_why_keeps_a_late_verdict_on_a_dead_process_apart_from_a_living_one() -> None:
@@ -213,68 +170,6 @@ def test_a_waiter_of_another_plan_sees_the_room_being_made(driver: CoreDriver) -
     assert why(driver, "w")["condition"] == "making_room"
     assert driver.state(lease) == "revoking"
     assert det.name == "det"
-
-
-def test_the_eta_is_learnt_and_honest_about_not_knowing(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5)
-    vlm = driver.consumer("vlm")
-    waiter = vlm.acquire(5 * GIB)
-    assert (why(driver, "vlm")["eta_s"], why(driver, "vlm")["eta_source"]) == (None, "none")
-    driver.advance(1.0)
-    det.unload(lease, unload_s=0.5)
-    driver.until(lambda: driver.state(waiter) == "loading")
-    driver.advance(2.0)
-    vlm.load(waiter)
-    learnt = driver.arbiter.learnt()
-    assert learnt["det"]["drain_s"] == pytest.approx(1.0)
-    assert learnt["det"]["unload_s"] == pytest.approx(0.5)
-    assert learnt["vlm"]["load_s"] == pytest.approx(2.0, abs=0.01)
-
-    again = CoreDriver(8 * GIB, settings={"learnt": learnt})
-    det, lease = held(again, "det", 5)
-    det.use_begin(lease)
-    again.consumer("vlm").acquire(5 * GIB)
-    eta = why(again, "vlm")["eta_s"]
-    assert eta == pytest.approx(1.5 + learnt["det"]["verify_s"] + learnt["vlm"]["load_s"])
-    again.advance(0.4)
-    det.use_end(lease)
-    det.unloading(lease)
-    assert why(again, "vlm")["eta_s"] == pytest.approx(
-        0.5 + learnt["det"]["verify_s"] + learnt["vlm"]["load_s"]
-    )
-    det.release(lease)
-    assert why(again, "vlm")["eta_s"] == pytest.approx(
-        learnt["det"]["verify_s"] + learnt["vlm"]["load_s"]
-    )
-
-
-def test_a_load_without_eviction_is_a_record_too(driver: CoreDriver) -> None:
-    held(driver, "det", 5)
-    (record,) = driver.notes("switch")
-    assert (record["switched"], record["evicted"], record["verified"]) == (False, [], True)
-    assert (record["wait_ms"], record["drain_ms"], record["unload_ms"], record["verify_ms"]) == (
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-    )
-
-
-def test_a_lease_may_be_asked_about_by_its_id(driver: CoreDriver) -> None:
-    _, lease = held(driver, "det", 5)
-    waiter = driver.consumer("vlm").acquire(5 * GIB)
-    assert driver.why(waiter)["leases"] == driver.why("vlm")["leases"]
-    assert [told["lease_id"] for told in driver.why(lease)["leases"]] == [lease]
-
-
-def test_a_trace_is_carried_from_the_acquire_to_every_note(driver: CoreDriver) -> None:
-    det = driver.consumer("det")
-    event = Asked(det.client, driver.next_request(), Acquire("n", det.spec(1 * GIB)))
-    effects = driver.post(replace(event, traceparent="00-abc-def-01"))
-    (note,) = [effect for effect in effects if isinstance(effect, Note)]
-    assert note.about is not None
-    assert note.about.traceparent == "00-abc-def-01"
-    assert note.about.gpu == GpuId("GPU-0")
 
 
 def test_the_label_of_a_use_is_quoted_safely(driver: CoreDriver) -> None:

@@ -175,15 +175,6 @@ def test_pressure_plans_nothing_of_its_own(driver: CoreDriver) -> None:
     assert plan(driver) == []
 
 
-def test_after_a_restart_the_latest_holder_gives_the_bound(driver: CoreDriver) -> None:
-    held(driver, "holder", 4, ttl_s=10.0)
-    driver.restart()
-    driver.consumer("w").acquire(3 * GIB)
-    step = only(driver)
-    assert step["action"] == "serve"
-    assert step["in_s"] == pytest.approx(10.0 + d.FENCE_GRACE_S, abs=0.1)
-
-
 def test_behind_others_only_its_own_end_is_planned(driver: CoreDriver) -> None:
     in_use(driver, "holder", 6)
     driver.consumer("head").acquire(4 * GIB)
@@ -213,11 +204,6 @@ def test_there_is_no_estimate_where_nobody_will_be_asked() -> None:
     held(driver, "pinned", 6, evictable=False)
     driver.consumer("w").acquire(4 * GIB)
     assert why(driver, "w")["eta_s"] is None
-
-
-def test_a_resident_lease_has_no_plan(driver: CoreDriver) -> None:
-    held(driver, "w", 3)
-    assert plan(driver) == []
 
 
 LOADS = {name: {"load_s": 3.0} for name in ("head", "second", "third")}
@@ -250,10 +236,3 @@ def test_the_estimate_behind_a_load_counts_what_is_left_of_it() -> None:
     driver.consumer("second").acquire(2 * GIB)
     driver.advance(1.0)
     assert eta(driver, "second") == pytest.approx(2.0 + 3.0)
-
-
-def test_an_estimate_behind_an_unknown_load_is_unknown() -> None:
-    driver = CoreDriver(8 * GIB, settings={"learnt": {"second": {"load_s": 3.0}}})
-    driver.consumer("head").acquire(4 * GIB)
-    driver.consumer("second").acquire(2 * GIB)
-    assert eta(driver, "second") is None

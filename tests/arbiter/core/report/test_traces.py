@@ -8,24 +8,6 @@ HERS = f"00-{'a' * 32}-{'1' * 16}-01"
 HIS = f"00-{'b' * 32}-{'2' * 16}-01"
 
 
-def test_a_holder_is_asked_in_the_name_of_whoever_waits(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5)
-    assert "traceparent" not in driver.notes("granted")[-1]
-    vlm = driver.consumer("vlm")
-    vlm.traceparent = HERS
-    vlm.acquire(5 * GIB)
-    driver.advance(1.0)
-    assert {push["traceparent"] for push in driver.pushes("revoke")} == {HERS}
-    assert det.traceparent is None
-    assert driver.state(lease) == "revoking"
-
-
-def test_a_waiter_without_a_trace_names_none(driver: CoreDriver) -> None:
-    held(driver, "det", 5)
-    driver.consumer("vlm").acquire(5 * GIB)
-    assert "traceparent" not in driver.pushes("revoke")[0]
-
-
 def test_a_lease_that_is_called_back_belongs_to_the_caller(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver)
     det.traceparent = HERS

@@ -4,46 +4,13 @@ it does."""
 from tests.support.core_driver import CoreDriver, answer
 from tests.support.scenes import held, sent_away
 from vram_arbiter.arbiter.core.events import DOUBT_KEY
-from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB
-
-WAIT_S = d.LEASE_TTL_S + d.FENCE_GRACE_S
 
 
 def doubting() -> CoreDriver:
     driver = CoreDriver(16 * GIB)
     driver.journal[DOUBT_KEY] = {"why": "its seal is missing"}
     return driver
-
-
-def phase(driver: CoreDriver) -> str:
-    return str(driver.status()["phase"])
-
-
-def test_holders_that_came_back_are_not_enough() -> None:
-    driver = doubting()
-    det, lease = held(driver, "det", 5)
-    token = det.token(lease)
-    driver.restart()
-    assert driver.notes("recovered")[-1]["doubt"] == "its seal is missing"
-    det.connect()
-    assert answer(det.reattach(lease, token))["leases"][0]["kept"]
-    waiter = driver.consumer("waiter").acquire(GIB)
-    driver.advance(WAIT_S - 1.0)
-    assert (driver.state(waiter), phase(driver)) == ("queued", "recovering")
-    block = driver.gpu()["blocked"]
-    assert (block["code"], block.get("names")) == ("recovering", None), "they are not known"
-    assert DOUBT_KEY in driver.journal, "the next start would doubt as well"
-    driver.advance(2.0)
-    assert (driver.state(waiter), phase(driver)) == ("loading", "serving")
-    assert DOUBT_KEY not in driver.journal
-
-
-def test_an_empty_gpu_ends_the_doubt() -> None:
-    driver = doubting()
-    driver.restart()
-    driver.until(lambda: phase(driver) == "serving", limit_s=2.0)
-    assert DOUBT_KEY not in driver.journal
 
 
 def test_a_holder_with_a_later_token_is_believed() -> None:

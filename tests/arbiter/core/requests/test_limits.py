@@ -60,16 +60,6 @@ def test_whose_share_is_used_up_is_named_only_where_it_is_a_users() -> None:
     assert refusal(second.try_acquire(2 * GIB, exclusive=True)).details["uid"] == 7
 
 
-def test_the_last_places_are_for_requests_above_the_default_priority() -> None:
-    driver, _, _ = full()
-    for uid in (7, 8):
-        for number in range(2):
-            waiting(driver.consumer(f"crowd{number}", uid=uid))
-    late = driver.consumer("late", uid=9)
-    assert waiting(late) == {"limit": "waiters_max", "value": 28, "share": "all"}
-    assert waiting(late, priority=51) == {"limit": "waiters_max", "value": 32, "share": "all"}
-
-
 def test_a_place_is_free_again_when_its_waiter_is_gone() -> None:
     driver, _, _ = full()
     greedy = driver.consumer("greedy", uid=7)

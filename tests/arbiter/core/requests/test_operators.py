@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.engine_state import state_of
-from tests.support.scenes import give_back, held, in_use, shown
+from tests.support.scenes import give_back, held, in_use
 from vram_arbiter.arbiter.core.effects import Effect, Note, Signal
 from vram_arbiter.arbiter.core.events import SettingsChanged
 from vram_arbiter.arbiter.rpc import words
@@ -70,14 +70,6 @@ def test_an_evicted_holder_in_use_finishes_first(driver: CoreDriver, ops: Consum
     assert driver.notes("verified")[-1]["verdict"] == "verified"
 
 
-def test_evicting_twice_asks_once(driver: CoreDriver, ops: Consumer) -> None:
-    _, lease = held(driver, "det", 5)
-    order_of(ops, "evict", lease)
-    effects = order_of(ops, "evict", lease)
-    assert (noted(effects)["repeated"], noted(effects)["lease_id"]) == (True, lease)
-    assert len(driver.notes("revoke_asked")) == 1
-
-
 def test_a_holder_that_leaves_for_a_waiter_hears_of_the_operator(
     driver: CoreDriver, ops: Consumer
 ) -> None:
@@ -105,49 +97,7 @@ def test_the_push_of_a_repeated_evict_puts_off_no_other(driver: CoreDriver, ops:
     assert len(driver.pushes("revoke", lease)) == 3, "a quarter of a second after the first"
 
 
-@pytest.mark.parametrize("spec", [{"evictable": False}, {}])
-def test_a_pinned_holder_is_not_evicted_even_by_an_operator(
-    driver: CoreDriver, ops: Consumer, spec: dict[str, Any]
-) -> None:
-    _, lease = held(driver, "det", 5, **spec)
-    if not spec:
-        order_of(ops, "pin", lease)
-    assert refusal(order_of(ops, "evict", lease)).code == "bad_state"
-    assert driver.state(lease) == "held"
-
-
-def test_only_what_is_resident_can_be_evicted(driver: CoreDriver, ops: Consumer) -> None:
-    det = driver.consumer("det")
-    lease = det.acquire(5 * GIB)
-    assert refusal(order_of(ops, "evict", lease)).details["state"] == "loading"
-
-
 # -- who is meant
-def test_a_consumer_with_several_leases_has_to_be_named_by_lease(
-    driver: CoreDriver, ops: Consumer
-) -> None:
-    det, first = held(driver, "det", 1)
-    second = det.acquire(1 * GIB)
-    refused = refusal(order_of(ops, "evict", "det"))
-    assert (refused.code, refused.details["leases"]) == ("bad_request", [first, second])
-
-
-def test_of_a_resident_and_a_waiting_lease_the_resident_is_meant(
-    driver: CoreDriver, ops: Consumer
-) -> None:
-    det, first = held(driver, "det", 5, min_residency_s=100.0)
-    det.acquire(5 * GIB)
-    assert answer(order_of(ops, "pin", "det"))["lease"]["lease_id"] == first
-
-
-def test_nobody_and_the_dead_are_told_apart(driver: CoreDriver, ops: Consumer) -> None:
-    det, lease = held(driver, "det", 5)
-    det.die()
-    assert refusal(order_of(ops, "evict", "nobody")).code == "unknown_lease"
-    over = refusal(order_of(ops, "evict", lease))
-    assert (over.code, over.details["why"]) == ("lease_lost", "process_died")
-
-
 @pytest.mark.parametrize("evictable", [True, False])
 def test_every_refusal_says_what_to_do(driver: CoreDriver, ops: Consumer, evictable: bool) -> None:
     _, lease = held(driver, "det", 5, evictable=evictable)
@@ -167,120 +117,7 @@ def test_every_refusal_says_what_to_do(driver: CoreDriver, ops: Consumer, evicta
         assert refused.hint, action
 
 
-# -- pins
-def test_a_pin_keeps_a_holder_until_it_is_undone(driver: CoreDriver, ops: Consumer) -> None:
-    _, lease = held(driver, "det", 5)
-    vlm = driver.consumer("vlm")
-    waiting = vlm.acquire(3 * GIB)
-    assert driver.state(lease) == "revoking"
-    assert refusal(order_of(ops, "pin", lease)).code == "bad_state", "it was revoked before the pin"
-    vlm.cancel(waiting)
-
-    other = CoreDriver(8 * GIB)
-    operator = other.consumer("ops")
-    _, lease = held(other, "det", 5, min_residency_s=1.0)
-    policy = other.consumer("policy")
-    waiting = policy.acquire(4 * GIB)
-    order_of(operator, "pin", lease, "demo for the press")
-    other.advance(5.0)
-    assert other.state(lease) == "held"
-    assert other.state(waiting) == "queued"
-    why = other.why("policy")["leases"][0]
-    blocker = why["blockers"][0]
-    assert (blocker["condition"], blocker["by"]) == ("pinned", f"{BY}: demo for the press")
-    view = shown(other, lease)
-    assert (view["evictable"], view["pinned"]) == (False, f"{BY}: demo for the press")
-    order_of(operator, "unpin", lease, "")
-    assert other.state(lease) == "revoking"
-    assert other.notes("operator")[-1]["action"] == "unpin"
-
-
-def test_a_waiter_can_be_pinned_for_when_it_holds(driver: CoreDriver, ops: Consumer) -> None:
-    det, _ = held(driver, "det", 5, min_residency_s=100.0)
-    waiting = driver.consumer("policy").acquire(4 * GIB)
-    order_of(ops, "pin", waiting)
-    view = shown(driver, waiting)
-    assert view["pinned"].startswith(BY)
-    del det
-
-
-def test_only_an_operators_pin_is_undone(driver: CoreDriver, ops: Consumer) -> None:
-    _, mine = held(driver, "det", 1, evictable=False)
-    _, free = held(driver, "vlm", 1)
-    for lease, evictable in ((mine, False), (free, True)):
-        details = refusal(order_of(ops, "unpin", lease)).details
-        assert (details["problem"], details.get("evictable", True)) == ("not_pinned", evictable)
-
-
-# -- drain
-def test_a_drained_arbiter_grants_nothing_and_keeps_what_is_held(
-    driver: CoreDriver, ops: Consumer
-) -> None:
-    _, lease = held(driver, "det", 3)
-    effects = order_of(ops, "drain", reason="new driver")
-    assert answer(effects)["drained"] == f"{BY}: new driver"
-    assert noted(effects)["action"] == "drain"
-    waiting = driver.consumer("vlm").acquire(1 * GIB)
-    driver.advance(20.0)
-    assert (driver.state(lease), driver.state(waiting)) == ("held", "queued")
-    assert driver.status()["drained"] == f"{BY}: new driver"
-    assert driver.why("vlm")["leases"][0]["block"]["code"] == "drained"
-    assert answer(order_of(ops, "resume", reason=""))["drained"] == ""
-    driver.until(lambda: driver.state(waiting) == "loading")
-    assert answer(order_of(ops, "resume"))["drained"] == "", "resuming what is not drained is fine"
-
-
-@pytest.mark.parametrize("with_lease", [True, False])
-def test_a_drain_outlives_the_daemon(driver: CoreDriver, ops: Consumer, with_lease: bool) -> None:
-    if with_lease:
-        det, lease = held(driver, "det", 3)
-        token = det.token(lease)
-    order_of(ops, "drain", reason="new driver")
-    driver.restart()
-    assert driver.status()["drained"] == f"{BY}: new driver"
-    if with_lease:
-        det.connect()
-        det.reattach(lease, token)
-    ops.connect()
-    waiting = driver.consumer("vlm").acquire(1 * GIB)
-    driver.advance(20.0)
-    assert driver.state(waiting) == "queued"
-    order_of(ops, "resume")
-    assert "drain" not in driver.journal
-    driver.until(lambda: driver.state(waiting) == "loading")
-
-
 # -- the dead
-def test_the_lease_of_a_silent_holder_is_given_up_and_its_bytes_measured(
-    driver: CoreDriver, ops: Consumer
-) -> None:
-    det, lease = held(driver, "det", 5, ttl_s=600.0)
-    refused = refusal(order_of(ops, "release_dead", lease))
-    assert "not dead" in refused.message
-    driver.advance(450.0)
-    effects = order_of(ops, "release_dead", lease, "hangs since noon")
-    assert answer(effects)["state"] == "expired"
-    silent_s = pytest.approx(450.01)
-    assert orders(effects) == [
-        OperatorNote("release_dead", BY, "hangs since noon", silent_s=silent_s)
-    ]
-    assert driver.notes("expired")[-1]["why"] == "given_up"
-    (lost,) = driver.pushes("lost", lease)
-    assert lost["error"]["code"] == "lease_expired"
-    assert lost["error"]["details"]["order"] == {"by": BY, "reason": "hangs since noon"}
-    waiting = driver.consumer("policy").acquire(4 * GIB)
-    driver.advance(30.0)
-    assert driver.state(waiting) == "queued", "its bytes are still there"
-    det.hold(0)
-    driver.until(lambda: driver.state(waiting) == "loading")
-
-
-def test_a_lease_in_use_is_never_given_up(driver: CoreDriver, ops: Consumer) -> None:
-    _, lease = in_use(driver, "det", 5, ttl_s=600.0)
-    driver.advance(450.0)
-    assert "in use" in refusal(order_of(ops, "release_dead", lease)).message
-
-
 def test_a_holder_that_did_not_come_back_after_a_restart_needs_no_patience(
     driver: CoreDriver, ops: Consumer
 ) -> None:
@@ -411,39 +248,6 @@ def test_no_process_is_killed_in_the_middle_of_anothers_use(
     assert signals(order_of(ops, "kill", "policy")) == [(policy.process, "term")]
 
 
-def test_what_holds_nothing_is_not_killed(driver: CoreDriver, ops: Consumer) -> None:
-    held(driver, "det", 5, evictable=False)
-    driver.consumer("waits").acquire(5 * GIB)
-    assert refusal(order_of(ops, "kill", "waits")).details["problem"] == "not_held"
-
-
 def test_a_changed_setting_leaves_the_others_as_they_are(driver: CoreDriver) -> None:
     driver.post(SettingsChanged({"waiters_max": 3}))
     assert state_of(driver.arbiter).settings == replace(driver.settings, waiters_max=3)
-
-
-def test_the_history_names_each_order_with_who_and_why(driver: CoreDriver, ops: Consumer) -> None:
-    det, asleep = held(driver, "det", 5, standby=True)
-    person = driver.consumer("policy")
-    lease = person.acquire(5 * GIB)
-    det.unload(asleep)
-    driver.until(lambda: driver.state(lease) == "loading")
-    person.load(lease)
-    person.use_begin(lease)
-    given = [("pin", lease), ("unpin", lease), ("evict", lease), ("evict", lease)]
-    given += [("evict", asleep), ("drain", ""), ("resume", "")]
-    told = [
-        note
-        for action, target in given
-        for note in orders(order_of(ops, action, target, f"{action} it"))
-    ]
-    assert told == [
-        OperatorNote("pin", BY, "pin it"),
-        OperatorNote("unpin", BY, "unpin it"),
-        OperatorNote("evict", BY, "evict it", uses=1),
-        OperatorNote("evict", BY, "evict it", repeated=True),
-        OperatorNote("evict", BY, "evict it"),
-        OperatorNote("drain", BY, "drain it"),
-        OperatorNote("resume", BY, "resume it"),
-    ]
-    assert driver.state(asleep) == "over"

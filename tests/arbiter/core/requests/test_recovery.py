@@ -10,7 +10,7 @@ import pytest
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
 from tests.support.engine_state import state_of
 from tests.support.scenes import give_back
-from vram_arbiter.arbiter.core.effects import Note, Push
+from vram_arbiter.arbiter.core.effects import Push
 from vram_arbiter.arbiter.core.events import (
     Asked,
     ClientConnected,
@@ -27,7 +27,6 @@ from vram_arbiter.arbiter.core.model.lease import (
     Standby,
     Use,
 )
-from vram_arbiter.arbiter.core.model.records import ResidueRecord
 from vram_arbiter.arbiter.host.records import records_of
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey, Token, UseId
@@ -142,30 +141,6 @@ def test_a_restart_finds_a_lease_as_the_journal_has_it(
     assert core.nonces[det.process, "n1"] == lease
 
 
-def test_a_kept_lease_keeps_its_token_its_uses_and_its_charge(driver: CoreDriver) -> None:
-    det, lease, token = held_with_token(driver, "det", 5)
-    driver.restart()
-    assert driver.status()["phase"] == "recovering"
-    assert driver.gpu()["charged_bytes"] == 5 * GIB
-    assert "recovering" in driver.gpu()["blocked"]["text"]
-    vlm = driver.consumer("vlm")
-    waiter = vlm.acquire(1 * GIB)
-    assert driver.state(waiter) == "queued", "nothing is granted before everybody is accounted for"
-    det.connect()
-    (kept,) = answer(det.reattach(lease, token, uses=["goal"]))["leases"]
-    assert kept["kept"] is True
-    assert (kept["lease"]["state"], kept["lease"]["uses"], kept["lease"]["token"]) == (
-        "held",
-        1,
-        [1, 2],
-    )
-    driver.until(lambda: driver.state(waiter) == "loading")
-    assert driver.status()["phase"] == "serving"
-    assert vlm.token(waiter) > token, "tokens grow across restarts"
-    det.use_end(lease, "goal", token)
-    det.unload(lease)
-
-
 def test_re_attaching_to_a_daemon_that_did_not_restart_only_moves_the_connection() -> None:
     driver = CoreDriver(8 * GIB)
     det, lease, token = held_with_token(driver, "det", 5)
@@ -213,36 +188,6 @@ def test_a_re_attachment_keeps_the_uses_that_others_began_again_before_it() -> N
     driver.until(lambda: driver.state(vlm) == "loading")
 
 
-def test_wrong_tokens_and_wrong_processes_are_not_kept(driver: CoreDriver) -> None:
-    det, lease, token = held_with_token(driver, "det", 5)
-    thief = driver.consumer("thief")
-    spec = det.specs[lease]
-    asked = [
-        thief.reattach(lease, token, spec=spec),
-        det.reattach(lease, Token(1, 99)),
-        det.reattach(LeaseId("L0-5"), Token(0, 5), spec=spec),
-    ]
-    errors = [answer(effects)["leases"][0]["error"] for effects in asked]
-    assert [(error["code"], error["details"]) for error in errors] == [
-        ("not_permitted", {"lease_id": lease, "pid": det.process.pid}),
-        ("stale_token", {"lease_id": lease, "token": "1.99"}),
-        ("lease_lost", {"lease_id": "L0-5", "why": "unknown"}),
-    ], "only while recovering is anybody believed"
-
-
-def test_a_ready_that_was_lost_with_the_daemon_is_made_up_for(driver: CoreDriver) -> None:
-    det = driver.consumer("det")
-    lease = det.acquire(5 * GIB, 4 * GIB)
-    token = det.token(lease)
-    det.hold(3 * GIB)
-    driver.restart()
-    assert driver.state(lease) == "loading"
-    det.connect()
-    det.reattach(lease, token, held=True, measured_bytes=3 * GIB)
-    assert (driver.state(lease), driver.gpu()["charged_bytes"]) == ("held", 3 * GIB)
-    assert driver.journal[f"lease:{lease}"]["state"] == "held"
-
-
 def test_an_acquire_repeated_after_a_restart_reattaches_the_lease_that_it_finds() -> None:
     """The grant was journaled and lost with the daemon, so its holder has nothing to reattach: it
     repeats its acquire. Its renewals count from then on, as those of any holder; otherwise the
@@ -280,42 +225,6 @@ def test_a_renewal_without_a_reattachment_is_refused(driver: CoreDriver) -> None
     assert answer(det.renew((lease, token)))["alive"] == [lease]
 
 
-def test_a_holder_that_never_comes_back_expires_and_is_measured_away(driver: CoreDriver) -> None:
-    _, lease, _ = held_with_token(driver, "det", 5, ttl_s=10.0)
-    driver.restart()
-    waiter = driver.consumer("vlm").acquire(5 * GIB)
-    driver.advance(14.9)
-    assert driver.state(lease) == "held"
-    driver.device.held.clear()
-    driver.device.set(driver.consumer("x").process, 1 * GIB, driver.now)
-    driver.until(lambda: driver.state(waiter) == "loading", limit_s=12.0)
-    assert [note["seconds"] for note in driver.notes("serving")] == [pytest.approx(15.0)]
-    assert driver.journal.keys() == {f"lease:{waiter}"}
-
-
-def test_whoever_has_not_come_back_is_named(driver: CoreDriver) -> None:
-    for n in range(5):
-        held_with_token(driver, f"m{n}", 1)
-    driver.restart()
-    block = driver.gpu()["blocked"]
-    assert [name.split(" ")[0] for name in block["names"]] == ["m0", "m1", "m2"]
-    assert (block["code"], block["more"]) == ("recovering", 2)
-
-
-def test_a_dead_holder_is_accounted_for_at_once_and_its_bytes_are_a_debt() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease, _ = held_with_token(driver, "det", 5)
-    driver.restart()
-    waiter = driver.consumer("vlm").acquire(5 * GIB)
-    driver.device.lag_s = 0.5
-    det.die()
-    assert driver.status()["phase"] == "serving"
-    assert driver.state(waiter) == "queued"
-    took = driver.until(lambda: driver.state(waiter) == "loading")
-    assert took >= 0.5
-    assert driver.state(lease) == "over"
-
-
 def test_an_empty_gpu_takes_no_lease_from_a_living_holder(driver: CoreDriver) -> None:
     """A reading that says that the GPU is empty may lie, and a model may sleep in host RAM. Nobody
     has to be waited for there, that is all."""
@@ -341,36 +250,6 @@ def test_an_empty_gpu_takes_no_lease_from_a_living_holder(driver: CoreDriver) ->
     det.connect()
     assert answer(det.reattach(lease, token, uses=["goal"]))["leases"][0]["kept"] is True
     assert driver.state(lease) == "held"
-
-
-def test_who_does_not_come_back_to_an_empty_gpu_is_given_up_in_time(driver: CoreDriver) -> None:
-    _, lease, _ = held_with_token(driver, "det", 5, ttl_s=10.0)
-    driver.device.held.clear()
-    driver.restart()
-    waiter = driver.consumer("w").acquire(5 * GIB)
-    assert driver.state(lease) == "held"
-    (step,) = driver.why("w")["leases"][0]["plan"]
-    assert (step["action"], step["consumer"], step["because"]) == ("wait", "det", "not_back")
-    assert abs(step["in_s"] - 15.0) < 0.05
-    took = driver.until(lambda: driver.state(waiter) == "loading")
-    assert 15.0 - 0.02 < took < 15.1, "its ttl, and the grace"
-    assert driver.state(lease) == "over"
-
-
-def test_who_lets_go_after_a_restart_without_coming_back_is_waited_for_no_longer() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, lease, token = held_with_token(driver, "det", 5)
-    vlm, other, _ = held_with_token(driver, "vlm", 2)
-    driver.restart()
-    det.connect()
-    det.reattach(lease, token)
-    vlm.connect()
-    vlm.unloading(other)
-    vlm.release(other)
-    assert driver.status()["phase"] == "recovering"
-    vlm.hold(0)
-    driver.until(lambda: driver.status()["phase"] == "serving", limit_s=0.1)
-    assert (driver.state(lease), driver.state(other)) == ("held", "over")
 
 
 def test_a_revoke_goes_to_the_connection_that_reattached(driver: CoreDriver) -> None:
@@ -416,27 +295,6 @@ def test_what_a_process_keeps_beyond_its_context_comes_back_after_a_restart_too(
     driver.until(lambda: driver.gpu()["charged_bytes"] == 5 * GIB + 450 * MIB, limit_s=3.0)
 
 
-def test_verifications_and_debts_go_on_after_the_restart(driver: CoreDriver) -> None:
-    driver.device.lag_s = 3.0
-    det, lease, token = held_with_token(driver, "det", 4, residue_bytes=450 * MIB)
-    vlm, other, _ = held_with_token(driver, "vlm", 2)
-    driver.device.set(driver.consumer("x").process, 200 * MIB, driver.now)
-    det.unload(lease)
-    vlm.die()
-    assert {record["state"] for record in driver.journal.values()} == {"verifying", "debt"}
-    driver.restart()
-    assert driver.gpu()["charged_bytes"] == 6 * GIB
-    assert driver.state(lease) == "verifying"
-    assert driver.status()["phase"] == "serving", "nobody has to come back for these"
-    (gone,) = answer(vlm.connect() + vlm.reattach(other, Token(1, 4)))["leases"]
-    assert gone["error"]["details"] == {"lease_id": other, "why": "not_held"}
-    driver.until(lambda: driver.gpu()["charged_bytes"] == 450 * MIB, limit_s=5.0)
-    driver.restart(epoch=3)
-    assert driver.gpu()["charged_bytes"] == 450 * MIB, "residues are remembered"
-    assert det.process.pid in {process["pid"] for process in driver.gpu()["processes"]}
-    assert token.epoch == 1
-
-
 def test_a_debt_keeps_its_fence_grace_over_a_restart(driver: CoreDriver) -> None:
     """Regression: the hung holder may still be loading until it fences itself; a restart forgot
     that and gave its room away."""
@@ -448,38 +306,6 @@ def test_a_debt_keeps_its_fence_grace_over_a_restart(driver: CoreDriver) -> None
     driver.advance(driver.settings.fence_grace_s - 0.5)
     assert driver.state(waiter) == "queued"
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
-
-
-def test_a_lost_journal_believes_holders_for_a_while(driver: CoreDriver) -> None:
-    det, lease, token = held_with_token(driver, "det", 5)
-    loader = driver.consumer("loader")
-    loading = loader.acquire(2 * GIB)
-    driver.until(lambda: driver.state(loading) == "loading")
-    load_token = loader.token(loading)
-    driver.restart(keep_journal=False)
-    vlm = driver.consumer("vlm")
-    waiter = vlm.acquire(4 * GIB)
-    det.connect()
-    loader.connect()
-    assert answer(det.reattach(lease, token, measured_bytes=5 * GIB))["leases"][0]["kept"] is True
-    assert (
-        answer(loader.reattach(loading, load_token, held=False))["leases"][0]["lease"]["state"]
-        == "loading"
-    )
-    spec = det.spec(1 * GIB, gpu="7")
-    lost = answer(det.reattach(LeaseId("L1-77"), Token(1, 77), spec=spec))["leases"][0]
-    assert lost["error"]["code"] == "unknown_gpu"
-    future = answer(det.reattach(LeaseId("L9-1"), Token(9, 1), spec=spec))["leases"][0]
-    assert future["error"]["code"] == "lease_lost"
-    driver.advance(14.0)
-    assert driver.status()["phase"] == "recovering"
-    driver.advance(1.1)
-    assert driver.status()["phase"] == "serving"
-    assert driver.gpu()["charged_bytes"] == 7 * GIB
-    loader.load(loading)
-    assert driver.state(lease) == "revoking"
-    assert driver.state(waiter) == "queued"
-    assert f"lease:{lease}" in driver.journal
 
 
 @pytest.mark.parametrize(
@@ -535,25 +361,11 @@ def test_adopting_more_than_the_gpu_has_is_pressure_not_a_crash(driver: CoreDriv
     assert "revoking" in {driver.state(lease), driver.state(LeaseId("L1-50"))}
 
 
-def test_a_lost_journal_and_an_empty_gpu_serve_at_once(driver: CoreDriver) -> None:
-    driver.restart(keep_journal=False)
-    assert driver.status()["phase"] == "serving"
-    assert driver.consumer("det").acquire(5 * GIB)
-
-
 def test_one_empty_gpu_of_two_is_not_enough() -> None:
     driver = CoreDriver(8 * GIB, gpus=2)
     driver.devices[GpuId("GPU-1")].set(driver.consumer("x").process, 1 * GIB, driver.now)
     driver.restart(keep_journal=False)
     assert driver.status()["phase"] == "recovering"
-
-
-def test_records_of_a_gpu_that_is_gone_are_dropped(driver: CoreDriver) -> None:
-    record = ResidueRecord(pid=1, start_ticks=1, gpu="GPU-old", residue_bytes=5)
-    effects = driver.post(Recovered({"residue:1@1:GPU-old": record}))
-    assert type(effects[0]).__name__ == "JournalDelete"
-    assert isinstance(effects[-1], Note)
-    assert effects[-1].kind == "serving"
 
 
 def test_a_reading_from_before_the_restart_voids_nothing(driver: CoreDriver) -> None:

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, refusal
-from tests.support.scenes import held
-from vram_arbiter.arbiter.core.requests.requests import AT_ONCE, PROCESSES_REMEMBERED
+from vram_arbiter.arbiter.core.requests.requests import PROCESSES_REMEMBERED
 from vram_arbiter.schemas.defaults import GIB
 
 
@@ -60,37 +59,6 @@ def test_what_is_refused_at_once_is_noted_with_its_reason(
         person.process.pid,
         leased,
     )
-
-
-def test_timeouts_and_cancels_are_noted_too(full_queue: CoreDriver) -> None:
-    full_queue = CoreDriver(8 * GIB)
-    held(full_queue, "holder", 5, priority=99)[0].use_begin(
-        full_queue.status()["leases"][0]["lease_id"]
-    )
-    bounded, fickle = full_queue.consumer("bounded"), full_queue.consumer("fickle")
-    bounded.acquire(5 * GIB, wait_timeout_s=1.0)
-    lease = fickle.acquire(5 * GIB)
-    full_queue.advance(1.5)
-    fickle.cancel(lease)
-    (denied,) = full_queue.notes("denied")
-    (cancelled,) = full_queue.notes("cancelled")
-    assert (denied["consumer"], denied["code"]) == ("bounded", "wait_timeout")
-    assert (cancelled["consumer"], cancelled["why"]) == ("fickle", "holder_gave_up")
-
-
-def test_a_flood_of_refusals_is_counted_instead(full_queue: CoreDriver) -> None:
-    flooder, other = full_queue.consumer("flooder"), full_queue.consumer("other")
-    for _ in range(10 * AT_ONCE):
-        too_large(flooder)
-    too_large(other)
-    assert [note["consumer"] for note in full_queue.notes("refused")] == ["flooder"] * AT_ONCE + [
-        "other"
-    ]
-    full_queue.advance(1.5)
-    too_large(flooder)
-    too_large(flooder)
-    (last,) = [note for note in full_queue.notes("refused") if "left_out" in note]
-    assert (last["consumer"], last["left_out"]) == ("flooder", 9 * AT_ONCE)
 
 
 def test_little_is_remembered_of_those_who_were_refused(full_queue: CoreDriver) -> None:

@@ -4,7 +4,7 @@ yesterday."""
 from collections.abc import Mapping
 from typing import Any
 
-from tests.support.core_driver import CoreDriver, answer
+from tests.support.core_driver import CoreDriver
 from tests.support.scenes import held, in_use
 from vram_arbiter.arbiter.core.effects import Note, Sample
 from vram_arbiter.arbiter.core.events import MemorySampled, ProcessDied, Resumed
@@ -84,28 +84,6 @@ def test_a_verification_begins_again(driver: CoreDriver) -> None:
     driver.device.lag_s = 0.0
     driver.until(lambda: newest(driver, "verified")["resolved"], limit_s=2000.0, step_s=0.5)
     assert driver.state(second) == "over"
-
-
-def test_a_recovery_that_was_under_way_waits_for_its_holders_anew(driver: CoreDriver) -> None:
-    person, lease = held(driver, "a", 5, ttl_s=10.0)
-    token = person.token(lease)
-    driver.restart()
-    driver.advance(14.0)  # of ttl and grace, fifteen
-    driver.post(Resumed(NIGHT_S))
-    driver.advance(14.0)
-    person.connect()
-    assert answer(person.reattach(lease, token))["leases"][0]["kept"]
-
-
-def test_a_recovery_without_a_journal_waits_anew_too(driver: CoreDriver) -> None:
-    held(driver, "a", 5, ttl_s=10.0)
-    driver.restart(keep_journal=False)
-    driver.advance(14.0)
-    driver.post(Resumed(NIGHT_S))
-    driver.advance(14.0)
-    assert driver.status()["phase"] == "recovering"
-    driver.advance(1.5)
-    assert driver.status()["phase"] == "serving"
 
 
 def test_waiters_and_leases_on_their_way_out_keep_their_place(driver: CoreDriver) -> None:

@@ -1,48 +1,11 @@
 """Connections that come and go, deaths, and a journal that fails."""
 
-from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
+from tests.support.core_driver import Consumer, CoreDriver
 from tests.support.scenes import give_back, held
 from vram_arbiter.arbiter.core.effects import Note, Push, Refuse
-from vram_arbiter.arbiter.core.events import ClientConnected, ClientLeft, JournalFailed, ProcessDied
+from vram_arbiter.arbiter.core.events import ClientConnected, ClientLeft
 from vram_arbiter.schemas.defaults import GIB, MIB
-from vram_arbiter.schemas.ids import ClientId, GpuId, LeaseId, ProcessKey
-
-
-def test_a_first_client_makes_the_gpu_be_read_if_the_reading_is_old(driver: CoreDriver) -> None:
-    driver.advance(60.0)
-    assert driver.arbiter.next_deadline() is None, "nobody is interested: the GPU is left alone"
-    det = driver.consumer("det")
-    assert [type(e).__name__ for e in det.connect()] == [], "the reading for its hello is under way"
-    driver.advance(0.01)
-    assert det.connect() == []
-
-
-def test_bye_gives_everything_back(driver: CoreDriver) -> None:
-    det, runner = driver.consumer("det"), driver.consumer("runner")
-    held = det.acquire(2 * GIB)
-    det.load(held)
-    queued = det.acquire(7 * GIB)
-    runner.use_begin(held, "goal", det.token(held))
-    det.hold(0)
-    det.leave()
-    assert driver.state(held) == "verifying"
-    assert driver.state(queued) == "over"
-    driver.until(lambda: driver.state(held) == "over")
-    assert det.leave() == [], "twice is once"
-
-
-def test_a_dropped_connection_loses_its_waits_and_uses_but_nothing_resident() -> None:
-    driver = CoreDriver(8 * GIB)
-    det, runner = driver.consumer("det"), driver.consumer("runner")
-    held = det.acquire(2 * GIB, min_residency_s=60.0)
-    det.load(held)
-    queued = det.acquire(7 * GIB)
-    runner.use_begin(held, "goal", det.token(held))
-    det.leave("misconduct")
-    assert (driver.state(held), driver.state(queued)) == ("held", "over")
-    runner.leave("misconduct")
-    ended = driver.notes("use_ended")[-1]
-    assert (ended["why"], ended["by"]) == ("client_left", "misconduct")
+from vram_arbiter.schemas.ids import ClientId, GpuId
 
 
 def test_a_use_that_was_repeated_on_a_new_connection_outlives_the_old_one() -> None:
@@ -77,33 +40,6 @@ def test_pushes_go_to_another_living_connection_of_the_process(driver: CoreDrive
     )
 
 
-def test_a_death_ends_leases_waits_and_uses_and_its_bytes_are_measured_away() -> None:
-    driver = CoreDriver(8 * GIB)
-    driver.device.lag_s = 1.0
-    det, vlm = driver.consumer("det"), driver.consumer("vlm")
-    held = det.acquire(5 * GIB)
-    det.load(held)
-    own_wait = det.acquire(7 * GIB)
-    vlm_lease = vlm.acquire(3 * GIB)
-    det.die()
-    assert driver.state(held) == "over"
-    assert driver.state(own_wait) == "over"
-    assert driver.gpu()["charged_bytes"] == 5 * GIB, "a debt until measured gone"
-    driver.until(lambda: driver.state(vlm_lease) == "loading")
-    assert driver.notes("verified")[-1]["verdict"] == "verified"
-    took = driver.until(lambda: driver.gpu()["charged_bytes"] == 3 * GIB)
-    assert took <= 1.0
-    vlm.load(vlm_lease)
-    vlm.use_begin(vlm_lease)
-    runner = driver.consumer("runner")
-    runner.use_begin(vlm_lease, "goal", vlm.token(vlm_lease))
-    runner.die()
-    assert driver.notes("use_ended")[-1]["why"] == "process_died"
-    assert (
-        refusal(det.connect() + det.release(held, token=vlm.token(vlm_lease))).code == "lease_lost"
-    )
-
-
 def test_a_death_during_verification_needs_no_residue_any_more(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, residue_bytes=1 * GIB)
     det.unload(lease)
@@ -111,37 +47,6 @@ def test_a_death_during_verification_needs_no_residue_any_more(driver: CoreDrive
     driver.until(lambda: driver.state(lease) == "over")
     assert driver.gpu()["charged_bytes"] == 0
     assert driver.journal == {}
-
-
-def test_the_residue_of_a_dead_process_is_measured_away_too(driver: CoreDriver) -> None:
-    det, big = driver.consumer("det"), driver.consumer("big")
-    held = det.acquire(5 * GIB, residue_bytes=1 * GIB)
-    det.load(held)
-    give_back(driver, det, held)
-    assert driver.gpu()["charged_bytes"] == 1 * GIB
-    assert list(driver.journal) == [f"residue:{det.process}:GPU-0"]
-    waiting = big.acquire(7 * GIB)
-    assert driver.state(waiting) == "queued"
-    det.die()
-    driver.post(ProcessDied(det.process))
-    driver.until(lambda: driver.state(waiting) == "loading")
-    assert "lease:L1-1" not in driver.journal
-    assert driver.notes("verified")[-1]["lease_id"] is None
-
-
-def test_a_grant_that_cannot_be_written_is_taken_back(driver: CoreDriver) -> None:
-    det, vlm = driver.consumer("det"), driver.consumer("vlm")
-    held = det.acquire(5 * GIB)
-    waiting = vlm.acquire(5 * GIB)
-    driver.journal_failing = "disk full"
-    other = driver.consumer("other")
-    other.try_acquire(1 * GIB)
-    det.release(held)
-    driver.advance(1.0)
-    (denied,) = driver.pushes("denied", waiting)
-    assert denied["error"]["code"] == "journal_unavailable"
-    assert not driver.pushes("granted")
-    assert driver.gpu()["charged_bytes"] == 0, "nothing stays charged for it"
 
 
 def test_a_grant_taken_back_leaves_the_residue_of_its_process_charged(driver: CoreDriver) -> None:
@@ -169,16 +74,6 @@ def test_a_grant_in_reply_that_cannot_be_written_is_refused_once(driver: CoreDri
     assert notes[-2:] == ["journal_failed", "denied"]
 
 
-def test_other_records_that_fail_are_noted_and_nothing_else(driver: CoreDriver) -> None:
-    det = driver.consumer("det")
-    held = det.acquire(5 * GIB)
-    driver.journal_failing = "disk full"
-    det.load(held)
-    assert driver.state(held) == "held"
-    effects = driver.post(JournalFailed("residue:1@2:GPU-0", "disk full"))
-    assert [type(effect) for effect in effects] == [Note]
-
-
 def test_a_loading_holder_is_not_undone_by_a_later_record(driver: CoreDriver) -> None:
     """Regression: a pin that a full disk did not take withdrew the lease of a holder that was
     loading, and its bytes were given away."""
@@ -190,20 +85,6 @@ def test_a_loading_holder_is_not_undone_by_a_later_record(driver: CoreDriver) ->
     assert driver.state(loading) == "loading"
     assert driver.gpu()["charged_bytes"] == 5 * GIB
     assert not driver.pushes("denied")
-
-
-def test_a_release_is_told_though_its_record_fails(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5)
-    driver.journal_failing = "disk full"
-    det.hold(0)
-    answer(det.release(lease))
-    assert driver.notes("released")
-
-
-def test_strangers_to_the_core_die_unmourned(driver: CoreDriver) -> None:
-    assert driver.post(ProcessDied(ProcessKey(1, 1))) == []
-    assert driver.post(ClientLeft(ClientId("x"), "bye")) == []
-    assert driver.state(LeaseId("L1-1")) == "over"
 
 
 def test_who_owns_bytes_of_a_gpu_and_who_is_connected() -> None:

@@ -9,7 +9,7 @@ import pytest
 from tests.support.core_driver import CoreDriver, answer
 from tests.support.engine_state import state_of
 from tests.support.scenes import give_back, held, in_use
-from vram_arbiter.arbiter.core.effects import Note, Sample
+from vram_arbiter.arbiter.core.effects import Note
 from vram_arbiter.arbiter.core.events import MemorySampled
 from vram_arbiter.arbiter.core.scheduling import grants
 from vram_arbiter.schemas import defaults as d
@@ -30,24 +30,6 @@ def test_a_higher_priority_passes_and_equals_keep_their_order(driver: CoreDriver
     det.release(lease)
     driver.until(lambda: driver.state(high) == "loading")
     assert driver.state(low) == "queued"
-
-
-def test_a_small_one_passes_the_head_if_it_cannot_delay_it(driver: CoreDriver) -> None:
-    busy, busy_lease = in_use(driver, "busy", 4)
-    head = driver.consumer("head").acquire(5 * GIB)
-    assert driver.state(busy_lease) == "revoking"
-    small = driver.consumer("small")
-    fits_beside = small.acquire(2 * GIB)
-    driver.advance(0.01)
-    assert driver.state(fits_beside) == "loading", "5 + 2 fit once the holder is gone"
-    small.load(fits_beside)
-    too_big = driver.consumer("big").acquire(1 * GIB)
-    assert driver.state(too_big) == "queued", (
-        "there is room now, but the head would not fit beside it"
-    )
-    busy.use_end(busy_lease)
-    busy.unload(busy_lease)
-    driver.until(lambda: driver.state(head) == "loading")
 
 
 def test_nobody_passes_an_exclusive_head_or_when_its_room_is_about_to_come() -> None:
@@ -110,32 +92,7 @@ def test_the_debt_of_an_exclusive_holder_keeps_the_gpu_to_itself(end: str) -> No
     assert not driver.device.shown(driver.now)
 
 
-def test_residues_may_stay_beside_an_exclusive_lease(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
-    give_back(driver, det, lease)
-    alone = driver.consumer("alone").acquire(7 * GIB, exclusive=True)
-    driver.advance(0.01)
-    assert driver.state(alone) == "loading"
-
-
 # -- the second gate
-def test_an_old_reading_carries_no_grant_a_fresh_one_is_asked_for() -> None:
-    driver = CoreDriver(8 * GIB, settings={"probe_period_s": 100.0})
-    det = driver.consumer("det")
-    driver.advance(5.0)
-    effects = det.try_acquire(1 * GIB)
-    assert answer(effects)["state"] == "queued"
-    assert [e for e in effects if isinstance(e, Sample)] == [Sample(GpuId("GPU-0"))]
-    again = driver.consumer("vlm").try_acquire(1 * GIB)
-    assert not [e for e in again if isinstance(e, Sample)], "one is under way"
-    assert [lease.request.reason for lease in driver.arbiter.inspect().waiting.values()] == [
-        "reading",
-        None,
-    ]
-    driver.advance(0.01)
-    assert [view["state"] for view in driver.status()["leases"]] == ["loading", "queued"]
-
-
 def test_the_gpu_may_say_no_where_the_ledger_says_yes(driver: CoreDriver) -> None:
     """Total-only backend: bytes that appear while somebody loads cannot be explained, but they are
     not free either."""

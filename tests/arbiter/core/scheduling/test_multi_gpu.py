@@ -1,8 +1,6 @@
 """Several GPUs: a lease is placed on one of them and never split, every GPU has its own queue,
 and no GPU waits for another's sake."""
 
-from typing import Any
-
 import pytest
 
 from tests.support.core_driver import Consumer, CoreDriver, answer, refusal
@@ -316,23 +314,6 @@ def test_a_waiter_for_one_gpu_keeps_nobody_from_returning_to_another(driver: Cor
 
 
 # -- GPUs that fail, drains
-@pytest.mark.parametrize("trouble", [{"failing": "NVML_ERROR_GPU_IS_LOST"}, {"silent": True}])
-def test_a_gpu_that_cannot_be_read_blocks_itself_only(
-    driver: CoreDriver, trouble: dict[str, Any]
-) -> None:
-    for name, value in trouble.items():
-        setattr(driver.devices[ZERO], name, value)
-    driver.advance(5.0)
-    there = driver.consumer("there").acquire(5 * GIB, gpu="0")
-    anywhere = driver.consumer("anywhere").acquire(5 * GIB)
-    driver.until(lambda: driver.state(anywhere) == "loading", limit_s=1.0)
-    assert place(driver, anywhere) == ONE
-    driver.advance(10.0)
-    assert driver.state(there) == "queued"
-    driver.devices[ZERO].failing, driver.devices[ZERO].silent = "", False
-    driver.until(lambda: driver.state(there) == "loading", limit_s=3.0)
-
-
 def test_a_gpu_that_is_lost_keeps_its_leases_and_the_others_go_on(driver: CoreDriver) -> None:
     """Unplugged in the middle: what was held there stays charged there, and whoever may go
     elsewhere does."""

@@ -142,16 +142,6 @@ def test_parked_and_on_standby_it_comes_back_by_itself() -> None:
     assert ram(driver) == 0
 
 
-def test_a_holder_may_park_without_being_asked_and_then_does_not_come_back_unasked() -> None:
-    driver = driver_with()
-    vlm, lease = held(driver, "vlm", 5, park_bytes=5 * GIB, standby=True)
-    vlm.unload(lease, parked=True)
-    driver.until(lambda: driver.state(lease) == "parked")
-    driver.advance(60.0)
-    assert driver.state(lease) == "parked"
-    assert answer(vlm.release(lease, parked=True))["state"] == "parked", "a repeat"
-
-
 def test_a_load_from_ram_that_fails_may_stay_parked_or_end() -> None:
     """cuda-checkpoint#44: a restore that fails must not be the end of everything."""
     driver = driver_with()

@@ -16,43 +16,7 @@ from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import GpuId, LeaseId, ProcessKey
 
-
 # -- there and back
-def test_the_detector_returns_by_itself_after_the_grab(driver: CoreDriver) -> None:
-    det, lease, policy, wanted = sent_away(driver)
-    before = det.token(lease)
-    policy.use_begin(wanted, "grab")
-    driver.advance(60.0)
-    assert driver.state(lease) == "standby"
-    policy.use_end(wanted, "grab")
-    policy.unload(wanted)
-    driver.until(lambda: driver.state(lease) == "loading", limit_s=1.0)
-    (granted,) = driver.pushes("granted", lease)
-    assert granted["lease"]["lease_id"] == lease
-    assert det.token(lease) > before, "a fresh token"
-    det.load(lease)
-    view = shown(driver, lease)
-    assert (view["state"], view["standby"], view["charge_bytes"]) == ("held", True, 5 * GIB)
-    story = [(str(state), why) for _, state, why in driver.arbiter.inspect().leases[lease].story]
-    assert [why for state, why in story if state == "loading"] == ["granted", "returned"]
-    assert driver.notes("granted")[-1]["by_itself"] is True
-    assert driver.notes("switch")[-1]["switched"] is False
-
-
-def test_what_standby_looks_like(driver: CoreDriver) -> None:
-    det, lease, _, _ = sent_away(driver)
-    view = shown(driver, lease)
-    assert (view["gpu"], view["charge_bytes"], view["uses"]) == (None, 0, 0)
-    assert "ttl_left_s" not in view
-    assert "position" not in view
-    note = driver.notes("standby")[-1]
-    assert (note["left_for"], note["parked_bytes"]) == ("policy", 0)
-    assert driver.arbiter.inspect().leases[lease].story[-1][2] == "verified"
-    driver.advance(600.0)
-    assert driver.state(lease) == "standby", "nobody has to renew it"
-    assert answer(det.renew((lease, det.token(lease))))["alive"] == [lease]
-    (why,) = driver.why("det")["leases"]
-    assert (why["state"], why["back"], why["ahead"]) == ("standby", "left_for", "policy")
 
 
 def test_cancel_on_the_way_to_standby_is_heard(driver: CoreDriver) -> None:
@@ -118,16 +82,6 @@ def test_the_end_of_the_quiet_needs_no_reading_to_be_noticed() -> None:
     _, lease, policy, wanted = sent_away(driver, min_residency_s=20.0)
     policy.unload(wanted)
     driver.until(lambda: driver.state(lease) == "loading", limit_s=20.1)
-
-
-def test_who_came_back_unasked_has_no_claim_to_stay(driver: CoreDriver) -> None:
-    det, lease, policy, wanted = sent_away(driver, min_residency_s=2.0)
-    policy.unload(wanted)
-    driver.until(lambda: driver.state(lease) == "loading", limit_s=3.0)
-    det.load(lease)
-    policy.acquire(5 * GIB)
-    driver.advance(0.01)
-    assert driver.state(lease) == "revoking", "its minimum residency counts from its first use"
 
 
 def test_once_used_it_has_its_residency(driver: CoreDriver) -> None:
@@ -315,18 +269,6 @@ def test_the_reading_has_to_agree_before_it_comes_back(driver: CoreDriver) -> No
 
 
 # -- wanted now
-def test_reacquire_makes_it_a_waiter_that_makes_others_leave(driver: CoreDriver) -> None:
-    det, lease, policy, wanted = sent_away(driver)
-    told = answer(det.reacquire(lease))
-    assert (told["state"], told["lease"]["position"]) == ("queued", 1)
-    driver.until(lambda: driver.state(wanted) == "revoking", limit_s=0.1)
-    policy.unload(wanted)
-    driver.until(lambda: driver.state(lease) == "loading")
-    assert driver.pushes("granted", lease)
-    det.load(lease)
-    assert driver.notes("switch")[-1]["evicted"][0]["consumer"] == "policy"
-
-
 def test_reacquire_with_room_is_answered_at_once(driver: CoreDriver) -> None:
     det, lease, policy, wanted = sent_away(driver, min_residency_s=20.0)
     policy.unload(wanted)

@@ -11,20 +11,6 @@ from vram_arbiter.schemas.defaults import GIB
 
 
 # -- ends
-def test_giving_up_a_lease_on_standby(driver: CoreDriver) -> None:
-    det, lease, _, _ = sent_away(driver)
-    assert answer(det.cancel(lease)) == {"state": "cancelled"}
-    assert answer(det.cancel(lease)) == {"state": "cancelled"}, "a repeat"
-    assert driver.state(lease) == "over"
-    assert f"lease:{lease}" not in driver.journal
-
-
-def test_a_repeat_of_the_release_does_not_end_it(driver: CoreDriver) -> None:
-    det, lease, _, _ = sent_away(driver)
-    assert answer(det.release(lease))["state"] == "standby"
-    assert driver.state(lease) == "standby"
-
-
 def test_requests_that_make_no_sense_away_are_refused(driver: CoreDriver) -> None:
     det, lease, _, _ = sent_away(driver)
     assert refusal(det.ready(lease)).code == "bad_state"
@@ -32,14 +18,6 @@ def test_requests_that_make_no_sense_away_are_refused(driver: CoreDriver) -> Non
     assert refusal(det.unloading(lease)).code == "bad_state"
     assert refusal(det.oom(lease, 1)).code == "bad_state"
     assert answer(det.ack(lease))["state"] == "standby"
-
-
-@pytest.mark.parametrize("reason", ["bye", "silent while connections were needed"])
-def test_it_ends_with_its_connection(driver: CoreDriver, reason: str) -> None:
-    det, lease, _, _ = sent_away(driver)
-    det.leave(reason)
-    assert driver.state(lease) == "over"
-    assert f"lease:{lease}" not in driver.journal
 
 
 @pytest.mark.parametrize("end", [Consumer.leave, Consumer.die], ids=["connection", "process"])
@@ -55,21 +33,7 @@ def test_who_ends_during_the_measurement_does_not_want_it_back(
     assert driver.state(lease) == "over"
 
 
-def test_it_ends_with_its_process(driver: CoreDriver) -> None:
-    det, lease, _, _ = sent_away(driver)
-    det.die()
-    assert driver.state(lease) == "over"
-    assert driver.notes("lost")[-1]["lease_id"] == lease
-
-
 # -- operators
-def test_whom_an_operator_evicts_does_not_come_back(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5, standby=True)
-    order(driver, "evict", lease)
-    give_back(driver, det, lease)
-    assert driver.journal == {}
-
-
 def test_an_operators_word_outweighs_the_engines() -> None:
     """The engine asked it to leave, then an operator evicts it: at any step of its way out."""
     for steps in range(3):

@@ -8,8 +8,7 @@ import pytest
 
 from tests.support.core_driver import CoreDriver
 from tests.support.scenes import held
-from vram_arbiter.arbiter.core.events import MemorySampled, ProcessUse
-from vram_arbiter.schemas import defaults as d
+from vram_arbiter.arbiter.core.events import ProcessUse
 from vram_arbiter.schemas.defaults import GIB
 from vram_arbiter.schemas.ids import ProcessKey
 
@@ -81,16 +80,6 @@ def test_an_empty_gpu_that_cannot_be_true_accounts_for_no_holder_after_a_restart
     driver.restart()
     driver.advance(2.0)
     assert driver.status()["phase"] == "recovering"
-
-
-def test_a_little_more_than_everything_is_the_drivers_rounding(driver: CoreDriver) -> None:
-    driver.device.lies = {"used_bytes": 8 * GIB + d.MIB, "total_bytes": 8 * GIB - d.MIB}
-    driver.advance(2.0)
-    assert driver.gpu()["measured_used_bytes"] == 8 * GIB + d.MIB
-    sample = MemorySampled(driver.device.gpu, driver.now, 0, 8 * GIB, None)
-    driver.device.lies = {"used_bytes": 0, "total_bytes": 8 * GIB, "processes": None}
-    driver.post(sample)
-    assert driver.gpu()["measured_used_bytes"] == 0
 
 
 def test_a_reading_is_compared_with_what_is_leased_out_where_the_whole_is_not_known() -> None:

@@ -30,21 +30,6 @@ def total_only(driver: CoreDriver) -> None:
 
 
 # -- verified
-def test_two_equal_readings_after_the_release_are_enough(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
-    det.unload(lease)
-    took = driver.until(lambda: driver.state(lease) == "over", step_s=0.001)
-    assert took == pytest.approx(0.005, abs=0.0005), (
-        "readings begin 2 ms apart, and the second one takes 1 ms"
-    )
-    (note,) = driver.notes("verified")
-    assert (note["verdict"], note["before_bytes"], note["after_bytes"]) == (
-        "verified",
-        5 * GIB,
-        450 * MIB,
-    )
-    assert note["ms"] == pytest.approx(5.0, abs=0.001), "from the release on"
-    assert driver.gpu()["charged_bytes"] == 450 * MIB
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.001, 0.25, 0.7, 1.5, 1.99])
@@ -374,18 +359,6 @@ def test_a_living_process_that_keeps_too_much_is_charged_for_it(driver: CoreDriv
     assert driver.gpu()["charged_bytes"] == 6 * GIB + 450 * MIB, "it came back later: noticed"
 
 
-def test_totals_alone_charge_the_shortfall_to_the_process_that_let_go(driver: CoreDriver) -> None:
-    total_only(driver)
-    det, lease = held(driver, "det", 5)
-    driver.advance(1.0)
-    det.unloading(lease)
-    det.hold(2 * GIB)
-    det.release(lease)
-    driver.advance(11.0)
-    assert verdicts(driver) == [("residue", True)]
-    assert driver.gpu()["charged_bytes"] == 2 * GIB
-
-
 # -- contested
 def test_others_that_grew_are_named_and_charged_as_stowaways(driver: CoreDriver) -> None:
     det, lease = held(driver, "det", 5, residue_bytes=100 * MIB)
@@ -421,20 +394,6 @@ def test_what_nobody_in_the_list_explains_is_not_charged_to_who_is_in_it() -> No
     assert driver.gpu()["charged_bytes"] == 100 * MIB
 
 
-def test_a_dead_process_that_the_driver_still_lists_stays_charged(driver: CoreDriver) -> None:
-    driver.device.lag_s = 15.0
-    det, lease = held(driver, "det", 5)
-    waiter = driver.consumer("w").acquire(5 * GIB)
-    det.die()
-    driver.advance(14.0)
-    assert verdicts(driver) == [("contested", False)]
-    assert driver.gpu()["charged_bytes"] == 5 * GIB
-    assert driver.state(waiter) == "queued"
-    driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
-    assert verdicts(driver)[-1] == ("verified", True)
-    assert driver.state(lease) == "over"
-
-
 def test_totals_alone_and_a_dead_process_end_contested_if_the_ledger_explains_the_gpu() -> None:
     driver = CoreDriver(8 * GIB)
     total_only(driver)
@@ -454,23 +413,6 @@ def test_totals_alone_and_a_dead_process_end_contested_if_the_ledger_explains_th
 
 
 # -- stale and unverifiable
-def test_no_reading_means_unknown_and_frees_nothing(driver: CoreDriver) -> None:
-    det, lease = held(driver, "det", 5)
-    waiter = driver.consumer("w").acquire(5 * GIB)
-    det.unloading(lease)
-    driver.device.failing = "driver hangs"
-    det.hold(0)
-    det.release(lease)
-    driver.advance(20.0)
-    assert verdicts(driver) == [("stale", False)]
-    assert len(driver.notes("probe_failed")) == 1
-    assert (driver.state(lease), driver.state(waiter)) == ("verifying", "queued")
-    assert driver.gpu()["measured_used_bytes"] is None
-    driver.device.failing = ""
-    driver.until(lambda: driver.state(waiter) == "loading", limit_s=3.0)
-    assert len(driver.notes("probe_ok")) == 1
-
-
 def test_a_probe_that_never_answers_is_asked_again_and_again(driver: CoreDriver) -> None:
     driver.device.silent = True
     driver.advance(3.0)
@@ -512,19 +454,6 @@ def test_expired_bytes_stay_charged_until_measured_gone_after_the_holder_fenced_
     assert driver.state(waiter) == "queued", "it may still be loading until it fences itself"
     driver.until(lambda: driver.state(waiter) == "loading", limit_s=1.0)
     assert driver.gpu()["charged_bytes"] == 5 * GIB + 450 * MIB
-
-
-def test_a_lease_that_expires_while_it_loads_was_never_seen_complete(driver: CoreDriver) -> None:
-    hung = driver.consumer("hung")
-    hung.acquire(5 * GIB, ttl_s=1.0)
-    waiter = driver.consumer("w").acquire(5 * GIB)
-    driver.advance(1.1)
-    hung.hold(5 * GIB)
-    driver.advance(30.0)
-    assert driver.state(waiter) == "queued"
-    assert driver.gpu()["charged_bytes"] == 5 * GIB
-    hung.die()
-    driver.until(lambda: driver.state(waiter) == "loading", limit_s=12.0)
 
 
 @pytest.mark.parametrize("released_first", [True, False])
