@@ -1,10 +1,14 @@
 """Declared against measured: what is learnt from a lease's life, and who is told."""
 
+import pytest
+
 from tests.support.core_driver import CoreDriver, refusal
 from tests.support.scenes import in_use, revoked, shown
 from vram_arbiter.schemas import defaults as d
 from vram_arbiter.schemas.defaults import GIB, MIB
 from vram_arbiter.schemas.ids import GpuId, LeaseId
+
+TOLERANCE = d.VERIFY_TOLERANCE_BYTES
 
 
 def lived(
@@ -88,6 +92,27 @@ def test_who_holds_less_than_declared_is_named_when_it_leaves(driver: CoreDriver
     (note,) = driver.notes("drift")
     assert (note["part"], note["drift_bytes"]) == ("steady", -GIB)
     assert "below" in note["reason"]
+
+
+@pytest.mark.parametrize(
+    ("drift_bytes", "parts"),
+    [
+        (-TOLERANCE - 1, ["steady"]),
+        (-TOLERANCE, []),
+        (TOLERANCE, []),
+        (TOLERANCE + 1, ["load_peak", "steady"]),
+    ],
+)
+def test_within_the_tolerance_nobody_drifts(
+    driver: CoreDriver, drift_bytes: int, parts: list[str]
+) -> None:
+    det = driver.consumer("det")
+    lease = det.acquire(2 * GIB)
+    det.load(lease, measured_bytes=2 * GIB + drift_bytes)
+    assert shown(driver, lease).get("drift_bytes", 0) == (drift_bytes if parts else 0)
+    driver.advance(2.0)
+    det.unload(lease)
+    assert [note["part"] for note in driver.notes("drift")] == parts
 
 
 def test_a_load_that_is_cut_off_teaches_only_that_it_was_too_much(driver: CoreDriver) -> None:

@@ -79,6 +79,17 @@ def test_what_is_kept_says_the_same_after_a_restart() -> None:
     assert again.p95_bytes("det m", "steady") == 4
 
 
+def test_what_is_not_understood_is_left_out() -> None:
+    prints = Footprints(1 << 60)
+    prints.restore(
+        {
+            "a": {"load_peak": 5, "steady": ["x", -1, 0, 3], "oom": [1], "more": [1]},
+            "b": {"oom": [5, 999]},
+        }
+    )
+    assert prints.kept() == {"a": {"steady": [3]}, "b": {"oom": [5, OOM_LOADS]}}
+
+
 def test_models_that_nobody_loads_any_more_are_forgotten() -> None:
     prints = Footprints(1 << 60)
     prints.measured("old m", "steady", 1)

@@ -30,6 +30,8 @@ def total_only(driver: CoreDriver) -> None:
 
 
 # -- verified
+
+
 @pytest.mark.parametrize("lag_s", [0.0, 0.001, 0.25, 0.7, 1.5, 1.99])
 def test_memory_that_comes_back_is_noticed_within_ten_milliseconds(lag_s: float) -> None:
     driver = CoreDriver(8 * GIB)
