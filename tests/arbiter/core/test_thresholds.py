@@ -167,6 +167,13 @@ def two_gpus() -> tuple[CoreDriver, LeaseId, Consumer, LeaseId]:
     return driver, idle, slow, loading
 
 
+def test_small_ones_pass_a_head_that_waits_for_a_load_elsewhere() -> None:
+    driver, idle, _, _ = two_gpus()
+    driver.consumer("w").acquire(4 * GIB)
+    small = driver.consumer("small").acquire(1 * GIB, gpu="0")
+    assert (driver.state(idle), driver.state(small)) == ("held", "loading")
+
+
 @pytest.mark.parametrize(
     "trouble", ["it cannot be read", "pressure", "it has not been read since a suspend"]
 )
