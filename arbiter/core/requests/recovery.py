@@ -45,8 +45,6 @@ def on_recovered(core: Core, event: ev.Recovered) -> None:
     """Restore what the journal names, then wait for the holders. Records of a GPU that is gone are
     dropped."""
     core.serving = False
-    for gpu in core.gpus.values():
-        gpu.touched = True
     doubt: DoubtRecord | None = None
     held = 0
     for key, record in sorted(event.records.items()):  # a doubt first, residues after leases

@@ -274,8 +274,7 @@ def test_pressure_asks_nobody_for_what_a_leaving_holder_brings(
     driver.advance(2.0)
     assert driver.gpu()["pressure_bytes"] == 3 * GIB + more
     assert driver.state(idle) == "held"
-    driver.device.silent = True
-    driver.advance(2.1)
+    driver.advance(driver.arbiter.inspect().leases[idle].ready_at + 5.0 - driver.now)
     assert (driver.state(idle) == "revoking") == asked
 
 
