@@ -212,11 +212,11 @@ def test_coroutines_and_one_that_is_canceled_while_it_waits(
 
 
 def test_a_coroutine_uses_what_is_loaded_without_a_thread(
-    make: Make, monkeypatch: pytest.MonkeyPatch
+    make_policy: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The way to a thread and back was most of what a lease added to a coroutine's call."""
     monkeypatch.setattr(lease, "PAUSE_S", 0.0)
-    model = make()
+    model = make_policy()
 
     async def story() -> None:
         assert await model.later(1) == 1
