@@ -1,6 +1,6 @@
 """Stories: text files that play the engine and hold everything that it answers.
 
-A story is prose with commands, `>>> vlm.acquire(3 * GIB)`, as in a doctest. `play` runs them on a
+A story is prose with commands, `>>> vlm.acquire(3 * GIB)`, as in a doctest. `retold` runs them on a
 `CoreDriver` and writes below each command what the engine did: for each event its time and its
 effects with all their fields, and when the engine wants to be called next. Ticks and readings that
 bring nothing are counted in one line. To stay readable, a field that has its default is left out,
@@ -41,7 +41,7 @@ LAYOUT = TextWrapper(100, "  ", " " * 6, break_long_words=False, break_on_hyphen
 SUFFIXES = ("Note", "Push", "Reply", "View", "Record")
 
 
-def play(text: str) -> str:
+def retold(text: str) -> str:
     """Return a story with the answers that the engine gives now."""
     story = _Story()
     pieces = DocTestParser().parse(text)
@@ -187,7 +187,7 @@ def _short(name: str) -> str:
 
 def main() -> None:
     for path in map(Path, sys.argv[1:]):
-        path.write_text(play(path.read_text(encoding="utf-8")), encoding="utf-8")
+        path.write_text(retold(path.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.stories import play
+from tests.support.stories import retold
 
 FOLDER = Path(__file__).with_name("stories")
 STORIES = {path.stem: path.read_text(encoding="utf-8") for path in sorted(FOLDER.glob("*.txt"))}
@@ -15,6 +15,6 @@ STORIES = {path.stem: path.read_text(encoding="utf-8") for path in sorted(FOLDER
 def test_the_engine_answers_as_the_story_says(name: str) -> None:
     """`make stories` writes the answers anew. What then differs is to be read."""
     told = STORIES[name]
-    played = play(told)
+    played = retold(told)
     if played != told:
         pytest.fail("\n".join(unified_diff(told.splitlines(), played.splitlines(), lineterm="")))
