@@ -30,6 +30,14 @@ def total_only(driver: CoreDriver) -> None:
 
 
 # -- verified
+def test_bytes_that_left_are_those_of_a_charge_without_what_its_process_retains() -> None:
+    """Others' verdicts may count on so much."""
+    driver = CoreDriver(8 * GIB)
+    det, lease = held(driver, "det", 5, residue_bytes=450 * MIB)
+    det.unload(lease)
+    driver.until(lambda: driver.state(lease) == "over")
+    (left,) = state_of(driver.arbiter).gpus[GPU].left
+    assert left == (pytest.approx(driver.now, abs=0.1), 5 * GIB - 450 * MIB)
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.001, 0.25, 0.7, 1.5, 1.99])
