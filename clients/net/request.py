@@ -61,7 +61,7 @@ def ask(
 
 
 def checked(reply: Message) -> Message:
-    """Return a reply that is no refusal. Raises the error of one that is."""
+    """Return a reply. Raises the arbiter's error if it is a refusal."""
     if not reply.get("ok"):
         raise from_wire(reply["error"])
     return reply

@@ -110,7 +110,7 @@ class LerobotParams(ModelParams):
 
 
 def check_joints(given: JsonMap, names: tuple[str, ...], field: str) -> None:
-    """Raise ConfigError for each key of `given`, at `params.field`, that is no joint."""
+    """Raise ConfigError that names the keys of `given`, at `params.field`, without a joint."""
     unknown = [name for name in given if name not in names]
     if unknown:
         raise mistakes(
