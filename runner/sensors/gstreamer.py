@@ -113,7 +113,7 @@ def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> Slot
     """
     params = read_params(GStreamerParams, config.backend_params, "backend_params")
     if params.path is not None and not Path(params.path).is_file():
-        raise wrong("backend_params.path", f"there is no file {params.path}")
+        raise wrong("backend_params.path", f"file not found: {params.path}")
     libraries = load()
     text = build(params, probe_platform())
     try:

@@ -109,7 +109,7 @@ def make(config: SensorReaderConfig, clock: Clock, tee: FrameTee | None) -> Slot
     params = read_params(OpenCvParams, config.backend_params, "backend_params")
     need(config.backend, "cv2", extra="runner")
     if params.path is not None and not Path(params.path).is_file():
-        raise wrong("backend_params.path", f"there is no file {params.path}")
+        raise wrong("backend_params.path", f"file not found: {params.path}")
     return OpenCvReader(config.sensor_id, config.max_age_ms, params, clock, tee)
 
 

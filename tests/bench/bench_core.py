@@ -38,7 +38,7 @@ class Bench:
         self.queued: list[tuple[ClientId, LeaseId]] = []
         self.samples: dict[str, list[float]] = {}
         clients = [ClientId(f"{n:04x}") for n in range((leases + 2 * waiters) // PER_CLIENT + 4)]
-        # whoever waits holds nothing: nobody stands in his own way
+        # waiters hold nothing, so that none blocks itself
         holders = leases // PER_CLIENT + 1
         for number, client in enumerate(clients):
             process = ProcessKey(1000 + number, 1)

@@ -177,7 +177,7 @@ class Stage:
             await asyncio.sleep(0.02)
         listening = asyncio.create_task(stage._listen())
         stack.callback(listening.cancel)
-        # subscribed: a use of nobody's is refused, a ping is not told; a look is
+        # subscribed once a detection is told; a ping is not
         while not stage.events:
             await stage.detector.detect(b"\x89PNG\r\n\x1a\n", "cube")
             await asyncio.sleep(0.02)

@@ -98,7 +98,7 @@ async def goals_served(
     **options: Any,
 ) -> AsyncIterator[GoalServer]:
     """A goal server on a control thread; `options` are the server's. `estop_s`: short only where
-    the loop hangs; a machine that stands still for a second is no such loop."""
+    the loop hangs: a machine that stalls for a second must not look like that."""
     async with ControlThread(runner) as control:
         await control.call(lambda: None)
         server = GoalServer(endpoint, control, catalogue, SystemClock(), estop_s=estop_s, **options)

@@ -469,7 +469,7 @@ class Consumer(Program):
     async def _unload(self, holding: Holding) -> None:
         """Called by the library at the safe point, or after a loss."""
         used = self.cast.used_by_others(holding)
-        # nobody is there who could refuse
+        # without a connection no daemon can refuse
         alone = holding.lease.given_up and not self.client.connected
         if used and holding.lease.state != "gone" and not alone:
             self.world.fail(f"{holding.lease.lease_id} unloads while {used} use it")

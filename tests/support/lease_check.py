@@ -216,7 +216,7 @@ def _check_history(
     uses: dict[str, set[str]] = defaultdict(set)  # as far as they began since the daemon did
     epoch = seq = 0
     for event, t in zip(events, times, strict=True):
-        # a full disk, and a kill before there was room: nobody knows what ended meanwhile
+        # a full disk, and a kill before there was room: what ended meanwhile is unknown
         if event["seq"] > seq + 1:
             loading.clear()
             uses.clear()
@@ -241,7 +241,7 @@ def _check_history(
                 loading[gpu][lease] = str(event["consumer"])
             case "ready" | "released" | "lost" | "expired" | "denied":
                 loading[gpu].pop(lease, None)
-                # whoever let go while the arbiter was down ends by time, and rightly
+                # a lease released while the arbiter was down rightly ends by time
                 claim = claims.get(lease)
                 if kind == "expired" and claim is not None and t < claim.until:
                     if _hindered(hindrances, claim.pid, t):

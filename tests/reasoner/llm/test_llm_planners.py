@@ -132,7 +132,7 @@ def test_it_gives_up_after_three_unusable_answers(
         stand_in.json(api.says(*calls))
     with pytest.raises(LlmError):
         decide()
-    # a body that is no strict JSON is refused before its calls are read
+    # a body that is not strict JSON is refused before its calls are read
     if len(stand_in.asked) > 1:
         assert len(stand_in.asked) == 3
         assert problem in " ".join(api.told(stand_in.asked[2]))

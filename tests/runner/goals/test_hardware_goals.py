@@ -256,7 +256,7 @@ async def test_whoever_names_no_endpoint_stops_the_system_service_too(
     assert await asyncio.to_thread(main, ["estop", "--reason", "smoke"]) == 0
     assert made.twin.story == ["connect", "halt"]
     (tmp_path / "of-this-login").mkdir()
-    # nobody answers there: was that the robot that moves?
+    # a socket without a server: it may be the one of the robot that moves
     (tmp_path / "of-this-login" / "runner.sock").touch()
     assert await asyncio.to_thread(main, ["estop"]) == 1
     said = capfd.readouterr()

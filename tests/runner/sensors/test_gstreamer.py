@@ -375,7 +375,7 @@ def test_stop_wakes_waiters_ends_the_thread_and_start_begins_anew(
         ({"source": "test", "patern": "ball"},
          "backend_params.patern: unknown key; did you mean pattern?"),
         ({"source": "file", "path": "/no/such.mp4"},
-         "backend_params.path: there is no file /no/such.mp4"),
+         "backend_params.path: file not found: /no/such.mp4"),
         ({"source": "v4l2", "device": "/dev/video0", "codec": "h264", "platform": "tegra"},
          "or say platform: cpu_only to decode on the CPU"),
     ],

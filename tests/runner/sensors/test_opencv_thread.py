@@ -263,7 +263,7 @@ def test_stopping_does_not_wait_for_the_next_try(started_reader: Reading) -> Non
         ({"device": True}, "backend_params.device"),
         ({"device": 0, "width": 640}, "width and height go together"),
         ({"device": 0, "widht": 640}, "backend_params.widht: unknown key; did you mean width?"),
-        ({"path": "not-there.avi"}, "there is no file not-there.avi"),
+        ({"path": "not-there.avi"}, "file not found: not-there.avi"),
     ],
 )
 def test_wrong_parameters_are_refused_before_anything_starts(
